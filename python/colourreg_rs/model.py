@@ -76,7 +76,9 @@ class Camera:
         object.__setattr__(self, "params", ordered)
         object.__setattr__(self, "width", int(self.width))
         object.__setattr__(self, "height", int(self.height))
-        _core.View.canonical(self.model, self.width, self.height, self.vector, np.eye(3), np.zeros(3))  # the core's checks
+        _core.View.canonical(
+            self.model, self.width, self.height, self.vector, np.eye(3), np.zeros(3)
+        )  # the core's checks
 
     @property
     def vector(self) -> FloatArray:
@@ -126,7 +128,8 @@ class Pose:
     @property
     def centre(self) -> FloatArray:
         """The projection centre in the world frame."""
-        return -self.rotation.T @ self.translation
+        # Solved rather than transposed, as in the core: a rotation with few digits keeps its meaning.
+        return np.asarray(np.linalg.solve(self.rotation, -self.translation), dtype=np.float64)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,93 @@
+"""The compiled core. Arrays are C-contiguous; a wrong dtype, shape or order is refused with the argument's name.
+
+Frames: *world* is the cloud's frame; the *camera* frame is x right, y down, z forward. Pixel (0, 0) is the centre of
+the top-left pixel. Angles are radians. A wrong dtype raises ``TypeError``, a wrong shape ``ValueError``.
+"""
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+
+__version__: str
+debug_build: bool
+
+class ColourregError(Exception):
+    """The base of every error of colourreg."""
+
+class InvalidInputError(ColourregError):
+    """The values given cannot be worked with; the message holds the value and what to do."""
+
+class DegenerateError(ColourregError):
+    """The values do not determine what was asked; the message holds the figure that says so, and its limit."""
+
+class NotConvergedError(ColourregError):
+    """An iteration ended without a result that can be trusted."""
+
+class InternalError(ColourregError):
+    """A defect of colourreg."""
+
+class View:
+    """Camera and pose of one photo, or a DLT matrix (whose camera has a skew). Immutable."""
+
+    @classmethod
+    def canonical(
+        cls,
+        model: str,
+        width: int,
+        height: int,
+        params: FloatArray,
+        rotation: FloatArray,
+        translation: FloatArray,
+    ) -> View:
+        """From a camera model's name and parameters (in the order of ``model.PARAMETER_NAMES``) and
+        ``x_cam = rotation @ X + translation``. Raises InvalidInputError."""
+
+    @classmethod
+    def dlt(cls, P: FloatArray, width: int, height: int, distortion: FloatArray) -> View:
+        """From a (3, 4) projection matrix of any scale and sign, and distortion terms k1 k2 p1 p2 k3 (5,), which act as
+        in OPENCV on coordinates normalised by the matrix's own K. Raises DegenerateError for a camera at infinity."""
+
+    @property
+    def model(self) -> str: ...
+    @property
+    def width(self) -> int: ...
+    @property
+    def height(self) -> int: ...
+    @property
+    def params(self) -> FloatArray: ...
+    @property
+    def skew(self) -> float: ...
+    @property
+    def rotation(self) -> FloatArray: ...
+    @property
+    def translation(self) -> FloatArray: ...
+    @property
+    def centre(self) -> FloatArray: ...
+    @property
+    def max_angle(self) -> float:
+        """The angle from the optical axis, radians, beyond which the lens model folds back and nothing is visible."""
+
+    def matrix(self) -> FloatArray | None:
+        """``K [R | -R C]`` (3, 4), without distortion; ``None`` for fisheye and panorama."""
+
+def project(
+    view: View, xyz: FloatArray, *, out_xy: FloatArray | None = None, out_depth: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """World points (N, 3) to pixels (N, 2) and depths (N,).
+
+    Depth is along the optical axis, for fisheye and panorama the range. Both are NaN behind the camera and beyond the
+    lens's valid field; a position outside the image is given as it is. With both ``out_xy`` and ``out_depth`` the
+    results are written there. Source: the collinearity equations with Brown's or Kannala and Brandt's distortion.
+    """
+
+def unproject(view: View, xy: FloatArray) -> FloatArray:
+    """Pixels (N, 2) to unit directions (N, 3) in the world frame; NaN where nothing of the valid field is imaged."""
+
+def project_jacobians(view: View, xyz: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Pixels (N, 2) and their derivatives: by the world point (N, 2, 3), by the pose (N, 2, 6: rotation vector applied
+    on the left, then projection centre), by the camera's parameters (N, 2, K). NaN where not visible."""
+
+def decompose_dlt(P: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """(3, 4) → K (3, 3, upper triangular, K[2, 2] = 1), R (3, 3), projection centre (3,), and the matrix scaled so that
+    its third row gives the depth. Source: Hartley and Zisserman, Multiple View Geometry, 6.2.4."""

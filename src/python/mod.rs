@@ -1,0 +1,16 @@
+//! The Python module `colourreg_rs._core`: a list of what it holds. Wrappers only; the work is done in the core.
+
+mod arrays;
+mod errors;
+mod geometry;
+
+use pyo3::prelude::*;
+
+#[pymodule]
+fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
+    m.add("__version__", env!("CARGO_PKG_VERSION"))?;
+    m.add("debug_build", cfg!(debug_assertions))?;
+    errors::register(m)?;
+    geometry::register(m)?;
+    Ok(())
+}

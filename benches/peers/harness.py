@@ -1,0 +1,77 @@
+"""One measurement: every contender in a process of its own, in turn, so that all see the same machine.
+
+A contender is a function of this package that does its untimed preparation, then returns the seconds of the timed part.
+Its process's peak memory is what the operating system says of it; a run that only prepares gives the figure to subtract.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import os
+import statistics
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Figure:
+    """Median seconds and peak memory (MB) of one contender."""
+
+    name: str
+    seconds: float
+    peak_mb: float
+
+
+def run_once(function: Callable[..., float], arguments: Sequence[str]) -> tuple[float, float]:
+    """Seconds that the function returns, and the peak memory of its process in MB."""
+    command = [sys.executable, "-m", "benches.peers.harness", function.__module__, function.__name__, *arguments]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    output = process.stdout.read()
+    _, status, usage = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode != 0:
+        raise SystemExit(f"{function.__module__}.{function.__name__} ended with {process.returncode}")
+    return float(json.loads(output.splitlines()[-1])["seconds"]), usage.ru_maxrss / 1024
+
+
+def compare(
+    contenders: dict[str, Callable[..., float]], arguments: Sequence[str], repeats: int = 3, ours: str = "colourreg"
+) -> list[Figure]:
+    """Runs all contenders in turn, ``repeats`` times, and prints medians and ratios to ours."""
+    times: dict[str, list[float]] = {name: [] for name in contenders}
+    peaks: dict[str, list[float]] = {name: [] for name in contenders}
+    for _ in range(repeats):
+        for name, function in contenders.items():
+            seconds, peak = run_once(function, arguments)
+            times[name].append(seconds)
+            peaks[name].append(peak)
+    figures = [Figure(name, statistics.median(times[name]), max(peaks[name])) for name in contenders]
+    own = next(f for f in figures if f.name == ours)
+    print(f"| {'contender':32} | seconds | peak memory | time / {ours} |")
+    print(f"| {'-' * 32} | ------: | ----------: | ------: |")
+    for f in figures:
+        print(f"| {f.name:32} | {f.seconds:7.3f} | {f.peak_mb:8.0f} MB | {f.seconds / own.seconds:6.2f}× |")
+    return figures
+
+
+def _child() -> None:
+    module, name, *arguments = sys.argv[1:]
+    seconds = getattr(importlib.import_module(module), name)(*arguments)
+    print(json.dumps({"seconds": seconds}))
+
+
+def parser(question: str) -> argparse.ArgumentParser:
+    """The options that every comparison has."""
+    p = argparse.ArgumentParser(description=question)
+    p.add_argument("--points", type=int, default=10_000_000)
+    p.add_argument("--repeats", type=int, default=3)
+    return p
+
+
+if __name__ == "__main__":
+    _child()

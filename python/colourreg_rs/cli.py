@@ -1,0 +1,225 @@
+"""The command ``colourreg``: parse, call, print. What it does stands in the modules that it calls."""
+
+from __future__ import annotations
+
+import json
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from . import __version__
+from .errors import ColourregError, FileError, InvalidInputError
+from .progress import terminal_bars
+
+app = typer.Typer(
+    name="colourreg",
+    help="Puts the colours of photos onto laser scans, and says how accurate the result is.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+
+JsonOption = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the result for machines.")]
+
+
+class Method(StrEnum):
+    """How a view is estimated."""
+
+    dlt = "dlt"
+    resection = "resection"
+
+
+class Blend(StrEnum):
+    """How the colours of several photos become one."""
+
+    best = "best"
+    mean = "mean"
+    median = "median"
+
+
+class Sampling(StrEnum):
+    """How a photo is read between its pixels."""
+
+    bilinear = "bilinear"
+    bicubic = "bicubic"
+
+
+def _write_json(path: Path | None, result: dict[str, Any] | list[Any]) -> None:
+    if path is not None:
+        from .io.atomic import write_text
+
+        write_text(path, json.dumps(result, indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        print(f"colourreg {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Options that stand before the command."""
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder for what the demo makes.")] = Path("colourreg-demo"),
+    seed: Annotated[int, typer.Option(help="Another scene for another number.")] = 0,
+    json_file: JsonOption = None,
+) -> None:
+    """The main job on simulated data whose truth is known: scene, registration, coloured cloud, figures, pictures."""
+    from .demo import run_demo
+
+    with terminal_bars() as progress:
+        result = run_demo(out, seed=seed, progress=progress)
+    print(result.text())
+    _write_json(json_file, result.as_dict())
+
+
+@app.command()
+def info(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Clouds, photos, registrations, cameras, points.")],
+    json_file: JsonOption = None,
+) -> None:
+    """What clouds, photos (EXIF), registrations, cameras or lists of points hold."""
+    from .info import describe, lines
+
+    described = [describe(path) for path in files]
+    for path, description in zip(files, described, strict=True):
+        print(f"{path}:")
+        print("\n".join(f"  {line}" for line in lines(description)))
+    _write_json(json_file, described)
+
+
+@app.command()
+def register(
+    cloud: Annotated[Path, typer.Argument(help="The laser scan.")],
+    photo: Annotated[Path, typer.Argument(help="The photo.")],
+    out: Annotated[Path, typer.Option(help="The registration to write (JSON).")],
+    method: Annotated[Method, typer.Option(help="How the view is estimated.")] = Method.resection,
+    points: Annotated[Path | None, typer.Option(help="Control and check points (CSV: name,X,Y,Z,x,y).")] = None,
+    init: Annotated[Path | None, typer.Option(help="A registration to start from.")] = None,
+    camera: Annotated[Path | None, typer.Option(help="The camera (JSON), where it was calibrated.")] = None,
+    free: Annotated[
+        str | None, typer.Option(help="What is estimated: pose, f, aspect, pp, distortion, or parameters by name.")
+    ] = None,
+    prior: Annotated[
+        list[str] | None,
+        typer.Option(help="Hold a parameter softly: NAME=VALUE±SIGMA (or NAME=VALUE+-SIGMA); sigma 0 holds it."),
+    ] = None,
+    sigma: Annotated[float, typer.Option(help="Sigma of a photo coordinate in pixels, where the list has none.")] = 0.5,
+    loss: Annotated[str | None, typer.Option(help="Robust loss instead of rejection: huber, cauchy, tukey.")] = None,
+    distortion: Annotated[
+        str, typer.Option(help="Distortion terms beside a DLT matrix, for example k1,k2,p1,p2.")
+    ] = "",
+    dlt_parameters: Annotated[int, typer.Option(help="11 (h34 = 1, iterated) or 12 (singular values).")] = 11,
+    seed: Annotated[int, typer.Option(help="Of the search for blunders.")] = 0,
+    json_file: JsonOption = None,
+) -> None:
+    """Estimates from where, and with what camera, a photo was taken."""
+    from .register import RegisterOptions, register_photo
+
+    chosen = RegisterOptions(
+        method=method.value,
+        free=tuple(name.strip() for name in free.split(",") if name.strip()) if free else None,
+        priors=tuple(prior or ()),
+        sigma_xy=sigma,
+        loss=loss,
+        distortion=tuple(name.strip() for name in distortion.split(",") if name.strip()),
+        dlt_parameters=dlt_parameters,
+        seed=seed,
+    )
+    result = register_photo(cloud, photo, points=points, init=init, camera=camera, options=chosen)
+    result.save(out)
+    print(result.text())
+    print(f"wrote {out}")
+    _write_json(json_file, result.as_dict())
+
+
+@app.command()
+def colourise(
+    cloud: Annotated[Path, typer.Argument(help="The laser scan: LAS, LAZ, PLY or PCD.")],
+    registrations: Annotated[list[Path], typer.Argument(metavar="REG.json...", help="Registrations of its photos.")],
+    out: Annotated[Path, typer.Option(help="The coloured cloud: .las, .laz or .ply.")],
+    blend: Annotated[Blend, typer.Option(help="How several photos become one colour.")] = Blend.best,
+    sampling: Annotated[Sampling, typer.Option(help="How a photo is read between its pixels.")] = Sampling.bilinear,
+    max_distance: Annotated[float | None, typer.Option(help="Metres from the camera beyond which nothing is coloured.")] = None,
+    max_sigma: Annotated[float | None, typer.Option(help="Metres of ColourSigma beyond which nothing is coloured.")] = None,
+    level: Annotated[bool, typer.Option(help="Level exposure and white balance between photos.")] = False,
+    chunk: Annotated[int, typer.Option(help="Points held at a time.", min=1000)] = 1_000_000,
+    json_file: JsonOption = None,
+) -> None:
+    """Colours every point that a photo sees; all other points and all attributes stay as they are."""
+    from .colourise import ColouriseOptions, colourise_file
+
+    options = ColouriseOptions(
+        blend=blend.value,
+        sampling=sampling.value,
+        max_distance=max_distance,
+        max_sigma=max_sigma,
+        level_exposure=level,
+        chunk_size=chunk,
+    )
+    with terminal_bars() as progress:
+        result = colourise_file(cloud, registrations, out, options=options, progress=progress)
+    print(result.text())
+    _write_json(json_file, result.as_dict())
+
+
+@app.command()
+def evaluate(
+    registration: Annotated[Path, typer.Argument(metavar="REG.json", help="The registration.")],
+    points: Annotated[Path | None, typer.Option(help="More points (CSV); those that took no part are check points.")] = None,
+    json_file: JsonOption = None,
+) -> None:
+    """How accurate a registration is: RMS in pixels, and in metres at the object."""
+    from .evaluate import evaluate as evaluate_registration
+    from .evaluate import table
+    from .io.points import read_points
+    from .io.registration import read_registration
+    from .register import with_photo_sizes
+
+    views = with_photo_sizes(read_registration(registration), registration)
+    try:
+        result = evaluate_registration(views, read_points(points) if points else None)
+    except InvalidInputError as error:
+        raise FileError(registration, str(error)) from error
+    print(table(result))
+    _write_json(json_file, [e.as_dict() for e in result])
+
+
+for _command, _american in ((colourise, "colorize"),):
+    app.command(_american, hidden=True)(_command)
+
+
+def main() -> None:
+    """Runs the command; what goes wrong is one line on standard error and exit code 1."""
+    try:
+        app()
+    except ColourregError as error:
+        print(f"colourreg: {error}", file=sys.stderr)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        print("colourreg: interrupted; nothing was written", file=sys.stderr)
+        sys.exit(130)
+    except BrokenPipeError:
+        sys.exit(1)
+    except MemoryError:
+        print("colourreg: not enough memory; try a smaller --chunk or fewer photos at once", file=sys.stderr)
+        sys.exit(1)
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        print(f"colourreg: {where}{error.strerror or error}", file=sys.stderr)
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

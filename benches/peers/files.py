@@ -86,7 +86,9 @@ def main() -> None:
     for suffix in (".laz", ".las"):
         with tempfile.TemporaryDirectory(prefix="colourreg-bench-") as folder:
             make_input(Path(folder), options.points, suffix)
-            print(f"\ncolour {options.points / 1e6:g} M points, {suffix[1:].upper()} to {suffix[1:].upper()}, from 24 MP")
+            print(
+                f"\ncolour {options.points / 1e6:g} M points, {suffix[1:].upper()} to {suffix[1:].upper()}, from 24 MP"
+            )
             compare({"colourreg": colourreg, "laspy, recolour only": laspy_recolour}, [folder, suffix], options.repeats)
             sys.stdout.flush()
 

@@ -86,7 +86,9 @@ def demo(
 
 @app.command()
 def info(
-    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Clouds, photos, registrations, cameras, points.")],
+    files: Annotated[
+        list[Path], typer.Argument(metavar="FILE...", help="Clouds, photos, registrations, cameras, points.")
+    ],
     json_file: JsonOption = None,
 ) -> None:
     """What clouds, photos (EXIF), registrations, cameras or lists of points hold."""
@@ -151,8 +153,12 @@ def colourise(
     out: Annotated[Path, typer.Option(help="The coloured cloud: .las, .laz or .ply.")],
     blend: Annotated[Blend, typer.Option(help="How several photos become one colour.")] = Blend.best,
     sampling: Annotated[Sampling, typer.Option(help="How a photo is read between its pixels.")] = Sampling.bilinear,
-    max_distance: Annotated[float | None, typer.Option(help="Metres from the camera beyond which nothing is coloured.")] = None,
-    max_sigma: Annotated[float | None, typer.Option(help="Metres of ColourSigma beyond which nothing is coloured.")] = None,
+    max_distance: Annotated[
+        float | None, typer.Option(help="Metres from the camera beyond which nothing is coloured.")
+    ] = None,
+    max_sigma: Annotated[
+        float | None, typer.Option(help="Metres of ColourSigma beyond which nothing is coloured.")
+    ] = None,
     level: Annotated[bool, typer.Option(help="Level exposure and white balance between photos.")] = False,
     chunk: Annotated[int, typer.Option(help="Points held at a time.", min=1000)] = 1_000_000,
     json_file: JsonOption = None,
@@ -177,7 +183,9 @@ def colourise(
 @app.command()
 def evaluate(
     registration: Annotated[Path, typer.Argument(metavar="REG.json", help="The registration.")],
-    points: Annotated[Path | None, typer.Option(help="More points (CSV); those that took no part are check points.")] = None,
+    points: Annotated[
+        Path | None, typer.Option(help="More points (CSV); those that took no part are check points.")
+    ] = None,
     json_file: JsonOption = None,
 ) -> None:
     """How accurate a registration is: RMS in pixels, and in metres at the object."""

@@ -8,7 +8,7 @@ the size of the chunks nor on the number of threads.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,15 +17,12 @@ import numpy.typing as npt
 
 from . import _core
 from .errors import FileError, InvalidInputError
-from .io.clouds import CloudChunk, CloudReader, create_cloud, open_cloud
+from .io.clouds import CloudChunk, CloudReader, CloudWriter, create_cloud, open_cloud
 from .io.images import Photo, read_photo
 from .io.registration import read_registration
-from .model import FloatArray, Registration, View
+from .model import FloatArray, View
 from .overlap import Behind, prefetched
 from .progress import Progress, silent
-
-#: Pixels: how sure a registration without stated covariance of its photo coordinates is taken to be.
-IMAGE_SIGMA = 0.5
 
 
 @dataclass(frozen=True)
@@ -67,8 +64,49 @@ class ColouriseResult:
         return {**vars(self), "out": str(self.out) if self.out else None, "warnings": list(self.warnings)}
 
 
+@dataclass(frozen=True)
+class ColouredChunk:
+    """Colours (N, 3), the number of their view from 1 or 0 (N,), and the sigma of their place in metres (N,)."""
+
+    rgb: npt.NDArray[np.uint16]
+    source: npt.NDArray[np.uint16]
+    sigma: npt.NDArray[np.float32]
+
+    def over(self, before: npt.NDArray[np.uint16] | None) -> npt.NDArray[np.uint16]:
+        """The colours, with those from before, or black, where no photo saw the point."""
+        unseen = self.source == 0
+        if unseen.any():
+            self.rgb[unseen] = 0 if before is None else before[unseen]
+        return self.rgb
+
+
+class SigmaHistogram:
+    """The median of any number of sigmas in little memory: counts over a logarithmic scale, 2 % to the bin."""
+
+    _EDGES = np.geomspace(1e-6, 1e3, 1048)
+
+    def __init__(self) -> None:
+        self._counts = np.zeros(len(self._EDGES) + 1, np.int64)
+
+    def add(self, sigma: npt.NDArray[np.float32]) -> None:
+        """Counts those that are known."""
+        known = sigma[np.isfinite(sigma)]
+        self._counts += np.bincount(np.searchsorted(self._EDGES, known), minlength=len(self._counts))
+
+    def median(self) -> float | None:
+        """Metres, to 1 %; ``None`` where none was known."""
+        total = self._counts.sum()
+        if total == 0:
+            return None
+        i = int(np.searchsorted(np.cumsum(self._counts), total / 2))
+        return float(np.sqrt(self._EDGES[max(i - 1, 0)] * self._EDGES[min(i, len(self._EDGES) - 1)]))
+
+
 class Colouriser:
-    """Two passes: :meth:`see` every chunk, then :meth:`finish`, then :meth:`colour` every chunk."""
+    """Two passes: :meth:`see` every chunk, then :meth:`finish`, then :meth:`colour` every chunk.
+
+    With ``level_exposure``, :meth:`compare` every chunk between :meth:`finish` and :meth:`colour`.
+    """
 
     def __init__(
         self, views: Sequence[View], photos: Sequence[npt.NDArray[Any]], options: ColouriseOptions | None = None
@@ -78,8 +116,15 @@ class Colouriser:
         self.views = tuple(views)
         self.options = options or ColouriseOptions()
         self._photos = [np.ascontiguousarray(photo) for photo in photos]
-        self._buffers = [_core.DepthBuffer(view.core) for view in self.views]
+        self._buffers = [_core.DepthBuffer(view.core, max_distance=self.options.max_distance) for view in self.views]
         self._maps: list[_core.VisibilityMap] = []
+        self._exposure = _core.Exposure(len(self.views)) if self.levels else None
+        self._gains: FloatArray | None = None
+
+    @property
+    def levels(self) -> bool:
+        """Whether exposures are to be levelled, which takes two photos."""
+        return self.options.level_exposure and len(self.views) > 1
 
     def see(self, xyz: FloatArray) -> None:
         """First pass: the chunk's points hide what lies behind them."""
@@ -91,13 +136,117 @@ class Colouriser:
         self._maps = [buffer.finish() for buffer in self._buffers]
         self._buffers = []
 
-    def colour(
-        self, xyz: FloatArray
-    ) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.uint16], npt.NDArray[np.float32]]:
-        """Second pass: colours (N, 3), their view's number from 1 or 0 (N,), and their place's sigma in metres (N,)."""
+    def compare(self, xyz: FloatArray) -> None:
+        """What several photos see of the chunk tells how their exposures differ."""
+        assert self._exposure is not None
+        self._exposure.add(self._maps, self._photos, xyz)
+
+    def colour(self, xyz: FloatArray) -> ColouredChunk:
+        """Second pass. Points that no photo sees have source 0 and an undefined colour."""
+        if self._exposure is not None and self._gains is None:
+            self._gains = self._exposure.gains()
         options = self.options
         rgb, source = _core.colour_points(
-            self._maps, self._photos, xyz, sampling=options.sampling, blend=options.blend
+            self._maps, self._photos, xyz, sampling=options.sampling, blend=options.blend, gains=self._gains
         )
-        sigma = np.full(len(xyz), np.nan, np.float32)
-        return rgb, source, sigma
+        return ColouredChunk(rgb, source, np.full(len(xyz), np.nan, np.float32))
+
+
+def load_views(paths: Sequence[Path]) -> tuple[list[View], list[Photo]]:
+    """All views of all registrations with their photos, in order. Raises FileError."""
+    views, photos = [], []
+    for path in paths:
+        for view in read_registration(path).views:
+            if view.image is None:
+                raise FileError(path, f"view {view.name!r} names no photo", "give its image")
+            photo = read_photo(view.image)
+            size = (photo.info.width, photo.info.height)
+            if view.image_size is not None and view.image_size != size:
+                wanted = "{} x {}".format(*view.image_size)
+                raise FileError(
+                    view.image,
+                    f"has {size[0]} x {size[1]} pixels, its camera in {path} {wanted}",
+                    "use the photo that was registered, not a scaled or turned copy",
+                )
+            views.append(view if view.image_size else replace(view, size=size))
+            photos.append(photo)
+    return views, photos
+
+
+def colourise_file(
+    cloud: Path,
+    registrations: Sequence[Path],
+    out: Path,
+    *,
+    options: ColouriseOptions | None = None,
+    progress: Progress = silent,
+) -> ColouriseResult:
+    """Colours the cloud from all views of the registrations into ``out``, which appears whole or not at all.
+
+    Raises FileError where a file cannot be used, and where no point lies in any photo: that registration is of another
+    place or frame, and calling its result coloured would be wrong.
+    """
+    options = options or ColouriseOptions()
+    with open_cloud(cloud) as reader, create_cloud(out, like=reader) as writer:
+        views, photos = load_views(registrations)
+        colouriser = Colouriser(views, [photo.pixels for photo in photos], options)
+        low, high = _first_pass(reader, colouriser, progress)
+        coloured, counts, sigmas = _second_pass(reader, writer, colouriser, progress)
+        if coloured == 0:
+            raise FileError(cloud, _nothing_seen(views, low, high), "check the registration's frame and unit")
+    return ColouriseResult(
+        out=out,
+        points=reader.n_points,
+        coloured=coloured,
+        by_view={f"{i}: {view.name}": int(n) for i, (view, n) in enumerate(zip(views, counts, strict=True), start=1)},
+        median_sigma=sigmas,
+        warnings=tuple(reader.warnings),
+    )
+
+
+def _nothing_seen(views: Sequence[View], low: FloatArray, high: FloatArray) -> str:
+    extent = "x ".join(f"{a:.1f}…{b:.1f} " for a, b in zip(low, high, strict=True))
+    place = ", ".join(f"{v:.1f}" for v in views[0].core.centre)
+    return f"none of its points lies in any photo; it spans {extent}, view {views[0].name!r} stands at {place}"
+
+
+def _positions(reader: CloudReader, options: ColouriseOptions) -> Iterator[CloudChunk]:
+    return prefetched(reader.chunks(options.chunk_size, positions_only=True))
+
+
+def _first_pass(reader: CloudReader, colouriser: Colouriser, progress: Progress) -> tuple[FloatArray, FloatArray]:
+    """Fills and finishes the buffers; gives the cloud's extent."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    total = reader.n_points
+    for chunk in _positions(reader, colouriser.options):
+        colouriser.see(chunk.xyz)
+        low, high = np.fmin(low, np.fmin.reduce(chunk.xyz)), np.fmax(high, np.fmax.reduce(chunk.xyz))
+        progress("finding what hides what", chunk.start + len(chunk), total)
+    colouriser.finish()
+    if colouriser.levels:
+        for chunk in _positions(reader, colouriser.options):
+            colouriser.compare(chunk.xyz)
+            progress("levelling exposures", chunk.start + len(chunk), total)
+    return low, high
+
+
+def _second_pass(
+    reader: CloudReader, writer: CloudWriter, colouriser: Colouriser, progress: Progress
+) -> tuple[int, npt.NDArray[np.int64], float | None]:
+    """Colours and writes; gives the number of coloured points, those of each view, and the median sigma."""
+    counts = np.zeros(len(colouriser.views) + 1, np.int64)
+    sigmas = SigmaHistogram()
+    total = reader.n_points
+
+    def write(item: tuple[CloudChunk, ColouredChunk]) -> None:
+        chunk, new = item
+        writer.write(chunk, rgb=new.over(chunk.rgb), source=new.source, sigma=new.sigma)
+        progress("colouring", chunk.start + len(chunk), total)
+
+    with Behind(write) as writing:
+        for chunk in prefetched(reader.chunks(colouriser.options.chunk_size)):
+            new = colouriser.colour(chunk.xyz)
+            counts += np.bincount(new.source, minlength=len(counts))
+            sigmas.add(new.sigma)
+            writing.put((chunk, new))
+    return int(counts[1:].sum()), counts[1:], sigmas.median()

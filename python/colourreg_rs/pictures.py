@@ -40,7 +40,12 @@ def overlay(photo: npt.NDArray[Any], view: View, xyz: FloatArray, *, points: int
 
 
 def draw_cloud(
-    xyz: FloatArray, rgb: npt.NDArray[Any], view: View, *, size: int = 2, background: tuple[int, int, int] = (24, 26, 30)
+    xyz: FloatArray,
+    rgb: npt.NDArray[Any],
+    view: View,
+    *,
+    size: int = 2,
+    background: tuple[int, int, int] = (24, 26, 30),
 ) -> Image:
     """The coloured points as the view sees them, near ones over far ones."""
     assert view.image_size is not None

@@ -37,7 +37,11 @@ def full_registration(folder) -> Registration:
         covariance=Covariance(names, matrix @ matrix.T), statistics={"sigma0": 1.1, "dof": 10, "rms": 0.4},
     )  # fmt: skip
     matrix_view = View(
-        "by matrix", folder / "photo-2.jpg", dlt=np.arange(12.0).reshape(3, 4) / 7, dlt_distortion={"k1": -0.01}, size=(40, 30)
+        "by matrix",
+        folder / "photo-2.jpg",
+        dlt=np.arange(12.0).reshape(3, 4) / 7,
+        dlt_distortion={"k1": -0.01},
+        size=(40, 30),
     )
     return Registration((view, matrix_view), folder / "scan.laz", "PROJCS[...]")
 
@@ -50,7 +54,9 @@ def test_what_is_written_is_read_bit_for_bit(tmp_path):
     a, b = registration.views[0], back.views[0]
     assert (a.name, a.image, a.camera, a.method, a.statistics) == (b.name, b.image, b.camera, b.method, b.statistics)
     assert np.array_equal(a.pose.rotation, b.pose.rotation) and np.array_equal(a.pose.translation, b.pose.translation)
-    assert a.covariance.parameters == b.covariance.parameters and np.array_equal(a.covariance.matrix, b.covariance.matrix)
+    assert a.covariance.parameters == b.covariance.parameters and np.array_equal(
+        a.covariance.matrix, b.covariance.matrix
+    )
     for p, q in zip(a.points, b.points, strict=True):
         assert (p.name, p.role, p.status) == (q.name, q.role, q.status)
         for name in ("xyz", "xy", "sigma_xyz", "sigma_xy", "residual_xy"):

@@ -149,7 +149,9 @@ def read_bytes(path: str | Path, limit: int | None = None) -> bytes:
         if limit is not None:
             size = os.fstat(file.fileno()).st_size
             if size > limit:
-                raise FileError(path, f"has {size:,} bytes; {limit:,} are the most that is read", "is it the right file?")
+                raise FileError(
+                    path, f"has {size:,} bytes; {limit:,} are the most that is read", "is it the right file?"
+                )
         data: bytes = file.read()
         return data
 

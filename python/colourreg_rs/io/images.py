@@ -85,13 +85,17 @@ def _opened(path: Path, data: bytes) -> Iterator[Any]:
                     )
                 yield image
     except UnidentifiedImageError as error:
-        raise FileError(path, "is no JPEG, PNG or TIFF photo, or is broken", "export it again as one of them") from error
+        raise FileError(
+            path, "is no JPEG, PNG or TIFF photo, or is broken", "export it again as one of them"
+        ) from error
     except FileError:
         raise
     except Exception as error:
         # Pillow's decoders raise nearly anything on broken files: OSError, SyntaxError, struct.error, ValueError, ...
         detail = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise FileError(path, f"cannot be decoded: {detail[:120]}", "the file is probably damaged; copy it again") from error
+        raise FileError(
+            path, f"cannot be decoded: {detail[:120]}", "the file is probably damaged; copy it again"
+        ) from error
     finally:
         Image.MAX_IMAGE_PIXELS = before
 
@@ -146,7 +150,9 @@ def _info(image: Any, data: bytes) -> PhotoInfo:
     )
 
 
-def _focal_px(long_side: int, focal_mm: float | None, focal_35mm: float | None, details: Mapping[int, Any]) -> float | None:
+def _focal_px(
+    long_side: int, focal_mm: float | None, focal_35mm: float | None, details: Mapping[int, Any]
+) -> float | None:
     if focal_35mm is not None:
         return focal_35mm / 36.0 * long_side
     # FocalPlaneXResolution in pixels per unit, FocalPlaneResolutionUnit 2 inch, 3 cm, 4 mm.
@@ -199,7 +205,9 @@ def _sixteen_bits(path: Path, data: bytes, image: Any) -> npt.NDArray[np.uint16]
         try:
             pixels = _core.decode_png(np.frombuffer(data, np.uint8), MAX_PIXELS)
         except InvalidInputError as error:
-            raise FileError(path, f"cannot be decoded: {error}", "the file is probably damaged; copy it again") from error
+            raise FileError(
+                path, f"cannot be decoded: {error}", "the file is probably damaged; copy it again"
+            ) from error
     else:
         pixels = _sixteen_bit_tiff(path, data)
     if pixels.ndim == 2:
@@ -228,10 +236,14 @@ def _sixteen_bit_tiff(path: Path, data: bytes) -> npt.NDArray[np.uint16]:
         if "imagecodecs" in str(error):
             name = str(getattr(getattr(page, "compression", None), "name", "another codec"))
             raise FileError(
-                path, f"is a 16-bit TIFF compressed with {name}", "save it uncompressed or with ZIP (deflate) compression"
+                path,
+                f"is a 16-bit TIFF compressed with {name}",
+                "save it uncompressed or with ZIP (deflate) compression",
             ) from error
         detail = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise FileError(path, f"cannot be decoded: {detail[:120]}", "the file is probably damaged; copy it again") from error
+        raise FileError(
+            path, f"cannot be decoded: {detail[:120]}", "the file is probably damaged; copy it again"
+        ) from error
     if pixels.dtype != np.uint16 or pixels.ndim not in (2, 3):
         raise FileError(path, f"holds {pixels.dtype} values of shape {pixels.shape}", "convert it to 16-bit RGB")
     return np.asarray(pixels)

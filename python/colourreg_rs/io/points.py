@@ -42,7 +42,9 @@ def read_points(path: str | Path) -> list[ControlPoint]:
         point = _point(path, number, fields, column, separator)
         if point.name in seen:
             raise FileError(
-                path, f"line {number}: the name {point.name!r} stands in line {seen[point.name]} too", "give each point its own"
+                path,
+                f"line {number}: the name {point.name!r} stands in line {seen[point.name]} too",
+                "give each point its own",
             )
         seen[point.name] = number
         points.append(point)
@@ -94,7 +96,9 @@ def _header(path: Path, row: tuple[int, str], separator: str) -> tuple[list[str]
 
 def _fields(path: Path, number: int, line: str, separator: str, expected: int) -> list[str]:
     try:
-        fields = [field.strip() for field in next(csv.reader([line], delimiter=separator, strict=True, skipinitialspace=True))]
+        fields = [
+            field.strip() for field in next(csv.reader([line], delimiter=separator, strict=True, skipinitialspace=True))
+        ]
     except (csv.Error, StopIteration) as error:
         raise FileError(path, f"line {number}: {error}", "close the quotes in the line where they open") from error
     while len(fields) > expected and not fields[-1]:
@@ -112,7 +116,9 @@ def _number(path: Path, number: int, name: str, text: str, separator: str) -> fl
     if separator != "," and "," in text:
         if "." in text or text.count(",") > 1:
             raise FileError(
-                path, f"line {number}: {name} = {text!r} could mean several numbers", "write it without thousands separators"
+                path,
+                f"line {number}: {name} = {text!r} could mean several numbers",
+                "write it without thousands separators",
             )
         plain = text.replace(",", ".")
     if not plain:
@@ -150,7 +156,9 @@ def _point(path: Path, line: int, fields: Sequence[str], column: dict[str, int],
 
     role = fields[column["role"]].lower() if "role" in column else ""
     if role not in ("", "control", "check"):
-        raise FileError(path, f"line {line}: role = {role!r} is neither control nor check", "leave it empty for control")
+        raise FileError(
+            path, f"line {line}: role = {role!r} is neither control nor check", "leave it empty for control"
+        )
     try:
         return ControlPoint(
             name=name,
@@ -171,7 +179,9 @@ def write_points(path: str | Path, points: Iterable[ControlPoint]) -> None:
     photo_sigmas = any(p.sigma_xy is not None for p in points)
     text = io.StringIO()
     out = csv.writer(text, lineterminator="\n")
-    out.writerow([*REQUIRED, "role", *(("sX", "sY", "sZ") if object_sigmas else ()), *(("sx", "sy") if photo_sigmas else ())])
+    out.writerow(
+        [*REQUIRED, "role", *(("sX", "sY", "sZ") if object_sigmas else ()), *(("sx", "sy") if photo_sigmas else ())]
+    )
     for p in points:
         row: list[object] = [p.name, *map(repr, p.xyz.tolist()), *map(repr, p.xy.tolist()), p.role]
         if object_sigmas:

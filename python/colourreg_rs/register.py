@@ -261,3 +261,73 @@ def parse_prior(text: str) -> tuple[str, float, float]:
         return found[1], float(found[2]), float(found[3])
     except ValueError:
         raise InvalidInputError(f"prior {text!r} is not of the form NAME=VALUE±SIGMA, for example fx=3100±5") from None
+
+
+def _by_resection(
+    photo: Path, control: Sequence[ControlPoint], start: _Start, options: RegisterOptions
+) -> RegisterResult:
+    """Resection: robust against blunders, unless a robust loss was asked for instead."""
+    free = options.free or (("pose",) if start.calibrated else ("pose", "f"))
+    xyz, xy = np.stack([p.xyz for p in control]), np.stack([p.xy for p in control])
+    check = np.array([p.role == "check" for p in control])
+    pose = start.pose or Pose(np.eye(3), np.zeros(3))
+    given = View(photo.stem, photo, start.camera, pose)
+    priors = [parse_prior(text) for text in options.priors]
+    common: dict[str, Any] = {
+        "free": list(free),
+        "sigma_xy": _sigmas(control, options.sigma_xy),
+        "priors": priors,
+        "check": check,
+    }
+    if options.loss is not None:
+        result = _core.resect(given.core, xyz, xy, loss=options.loss, **common)
+    else:
+        unknown = not start.calibrated and "focal length unknown" in start.origin
+        result = _core.resect_robust(given.core, xyz, xy, seed=options.seed, unknown_focal=unknown, **common)
+    core = result.view
+    camera = replace(
+        start.camera, params=dict(zip(start.camera.params, core.params.tolist(), strict=True))
+    )
+    view = View(
+        name=photo.stem,
+        image=photo,
+        camera=camera,
+        pose=Pose(core.rotation, core.translation),
+        covariance=_covariance(result),
+        method="resection",
+        points=_judged(control, result),
+        statistics=_statistics(result),
+    )
+    verdict = result.verdict
+    return RegisterResult(
+        registration=Registration((view,)),
+        evaluation=evaluate_view(view),
+        notes=(f"{start.origin}; free: {', '.join(free)}",),
+        warnings=tuple(w.message for w in verdict.warnings),
+        trusted=verdict.ok,
+        free=tuple(free),
+        facts={
+            "error_in_the_middle_px": round(result.centre_error, 3),
+            "error_at_the_border_px": round(result.border_error, 3),
+        },
+    )
+
+
+def _covariance(result: Any) -> Covariance | None:
+    matrix = np.asarray(result.covariance)
+    return Covariance(tuple(result.parameters), matrix) if np.isfinite(matrix).all() else None
+
+
+def _judged(control: Sequence[ControlPoint], result: Any) -> tuple[ControlPoint, ...]:
+    """The points with their residuals and with what became of them."""
+    judged = []
+    for p, status, residual in zip(control, result.status, result.residuals, strict=True):
+        known = residual if np.isfinite(residual).all() else None
+        judged.append(replace(p, residual_xy=known, status="used" if status == "check" else status))
+    return tuple(judged)
+
+
+def _statistics(result: Any) -> dict[str, float]:
+    """What is known of the fit; figures that do not exist (no redundancy) are left out."""
+    figures = {name: float(getattr(result, name)) for name in ("sigma0", "dof", "rms", "rms_x", "rms_y", "rmse")}
+    return {name: value for name, value in figures.items() if np.isfinite(value)}

@@ -7,9 +7,11 @@
 //! Conventions: the camera frame is x right, y down, z forward; pixel (0, 0) is the *centre* of the top-left pixel;
 //! object space is float64 in the cloud's own frame and unit; angles are radians.
 
+pub mod colour;
 pub mod error;
 pub mod estimation;
 pub mod geometry;
+pub mod render;
 
 #[cfg(feature = "python")]
 mod python;

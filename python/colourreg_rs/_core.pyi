@@ -91,3 +91,92 @@ def project_jacobians(view: View, xyz: FloatArray) -> tuple[FloatArray, FloatArr
 def decompose_dlt(P: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """(3, 4) → K (3, 3, upper triangular, K[2, 2] = 1), R (3, 3), projection centre (3,), and the matrix scaled so that
     its third row gives the depth. Source: Hartley and Zisserman, Multiple View Geometry, 6.2.4."""
+
+class DepthBuffer:
+    """The nearest depth in each pixel of a view (and of a band of up to 32 pixels around it), merged by minimum: the
+    order of points and chunks and the number of threads cannot be seen in the result."""
+
+    def __init__(
+        self,
+        view: View,
+        *,
+        tolerance: float | None = None,
+        max_gap: float | None = None,
+        max_distance: float | None = None,
+        max_incidence: float | None = None,
+    ) -> None:
+        """``tolerance``: what is in front by less than this part of the depth (and what follows from slope and pixel
+        size) hides nothing; 0.003 if not given. ``max_gap``: the widest gap between points of one surface, pixels, that
+        is taken as covered; 64. ``max_distance`` (the cloud's unit) and ``max_incidence`` (radians from the surface's
+        normal, in (0, π/2]) refuse points. Memory: 4 bytes per pixel until finished. Raises InvalidInputError."""
+
+    def add(self, xyz: FloatArray) -> None:
+        """Puts a chunk (N, 3) in; NaN points are left out. Releases the GIL; several threads may call it at once.
+        Raises InvalidInputError after :meth:`finish`."""
+
+    def finish(self) -> VisibilityMap:
+        """The frozen map; the buffer goes into it and takes no more points. Raises InvalidInputError if called twice."""
+
+class IndexBuffer:
+    """The nearest point in each pixel of a view, and its index; of equal depths the lower index."""
+
+    def __init__(self, view: View) -> None: ...
+    def add(self, xyz: FloatArray, first: int = 0) -> None:
+        """Puts a chunk (N, 3) in whose first point is number ``first`` of the cloud. As :meth:`DepthBuffer.add`.
+        Raises InvalidInputError beyond 2³² − 1 points."""
+
+    def images(self) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]:
+        """Depth (H, W), NaN where empty, and index (H, W), −1 where empty."""
+
+class VisibilityMap:
+    """What one photo sees of the cloud: surfaces between the points, and how deep one sees in each pixel. Immutable.
+
+    A point is visible when it projects inside the photo, in front of the camera, in the lens's valid field, and is not
+    behind a surface: a place is covered where samples lie opposite each other about it, as far apart as their own
+    spacing allows, by more than a tolerance that follows depth noise, slope and spacing."""
+
+    @property
+    def view(self) -> View: ...
+    def visible(self, xyz: FloatArray) -> npt.NDArray[np.bool_]:
+        """Whether the photo sees each of the points (N, 3); NaN points are not seen."""
+
+    def depth(self) -> npt.NDArray[np.float32]:
+        """The nearest depth in each pixel (H, W), NaN where there is no point."""
+
+    def limit(self) -> npt.NDArray[np.float32]:
+        """The depth in each pixel (H, W) beyond which nothing is visible; infinite where nothing hides."""
+
+Photo = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+
+def colour_points(
+    maps: list[VisibilityMap],
+    photos: list[Photo],
+    xyz: FloatArray,
+    *,
+    sampling: str = "bilinear",
+    blend: str = "best",
+    gains: FloatArray | None = None,
+    normals: FloatArray | None = None,
+    out_rgb: npt.NDArray[np.uint16] | None = None,
+    out_source: npt.NDArray[np.uint16] | None = None,
+) -> tuple[npt.NDArray[np.uint16], npt.NDArray[np.uint16]]:
+    """Colours (N, 3) for points (N, 3) from photos (H, W, 3), and the number of the photo that gave each, from 1; 0
+    where no photo sees the point.
+
+    8-bit photos give their values times 256, interpolated values keep their fraction. ``sampling`` is bilinear or bicubic
+    (Keys, a = −1/2). ``blend`` is best (the best view: pixels per area of the surface, less at the photo's border and
+    beside depth edges), mean (weighted) or median (weighted geometric median; with two photos the better). ``gains``
+    (V, 3) multiply the photos' channels; ``normals`` (N, 3), world frame, are used in the weights in place of those of
+    the depth buffer. Given ``out_rgb`` and ``out_source`` are written into; rgb of points that no photo sees is left as it
+    is there. Points are independent of each other, so that chunks cannot be seen in the result. Raises
+    InvalidInputError where photos and cameras differ in size."""
+
+class Exposure:
+    """Gains that make photos agree on points that several of them see (Brown and Lowe 2007, section 6)."""
+
+    def __init__(self, views: int) -> None: ...
+    def add(self, maps: list[VisibilityMap], photos: list[Photo], xyz: FloatArray) -> None:
+        """Collects a chunk; order and threads do not matter."""
+
+    def gains(self) -> FloatArray:
+        """(V, 3), one for each photo and channel; 1 for a photo that shares no points with others."""

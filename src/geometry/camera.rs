@@ -75,7 +75,7 @@ pub enum Depth {
 }
 
 #[derive(Debug, Clone, Copy, PartialEq)]
-enum Lens {
+pub(super) enum Lens {
     Polynomial(Polynomial),
     Fisheye(Fisheye),
     Equirectangular,
@@ -89,12 +89,12 @@ pub struct Camera {
     pub width: u32,
     /// Pixels.
     pub height: u32,
-    fx: f64,
-    fy: f64,
-    cx: f64,
-    cy: f64,
-    skew: f64,
-    lens: Lens,
+    pub(super) fx: f64,
+    pub(super) fy: f64,
+    pub(super) cx: f64,
+    pub(super) cy: f64,
+    pub(super) skew: f64,
+    pub(super) lens: Lens,
 }
 
 /// A projected point with its derivatives.
@@ -218,7 +218,8 @@ impl Camera {
         match &self.lens {
             Lens::Polynomial(lens) => {
                 if p.z > 0.0 {
-                    let [xd, yd] = lens.distort(p.x / p.z, p.y / p.z)?;
+                    let iz = 1.0 / p.z;
+                    let [xd, yd] = lens.distort(p.x * iz, p.y * iz)?;
                     Some(self.pixel_at(xd, yd))
                 } else {
                     None

@@ -1,14 +1,18 @@
 //! Poses and cameras: from points to pixels and back, with derivatives. Small, pure functions.
 
+mod block;
 mod camera;
 mod fisheye;
+mod frustum;
 mod polynomial;
 mod pose;
 mod project;
 mod roots;
 mod view;
 
+pub use block::{Block, BlockProjector, LANES};
 pub use camera::{Camera, Depth, MAX_PARAMS, Model, Projection};
+pub use frustum::Frustum;
 pub use pose::{Pose, rotation_exp, rotation_log, skew_matrix};
 pub use project::{ViewJacobian, project, project_into, unproject};
 pub use view::{DltParts, View};

@@ -64,7 +64,7 @@ impl Polynomial {
     }
 
     #[inline(always)]
-    fn distort_unchecked(&self, x: f64, y: f64, r2: f64) -> [f64; 2] {
+    pub fn distort_unchecked(&self, x: f64, y: f64, r2: f64) -> [f64; 2] {
         let [_, _, p1, p2, ..] = self.k;
         let g = self.radial(r2);
         let xy2 = 2.0 * x * y;

@@ -50,8 +50,10 @@ impl Pose {
     /// World to camera.
     #[inline(always)]
     pub fn transform(&self, p_world: &[f64; 3]) -> Vector3<f64> {
-        let d = Vector3::new(p_world[0] - self.centre.x, p_world[1] - self.centre.y, p_world[2] - self.centre.z);
-        self.rotation * d
+        let (x, y, z) = (p_world[0] - self.centre.x, p_world[1] - self.centre.y, p_world[2] - self.centre.z);
+        // Written out, so that many points at once (`block`) get the same bits as one.
+        let row = |i: usize| self.rotation[(i, 0)] * x + self.rotation[(i, 1)] * y + self.rotation[(i, 2)] * z;
+        Vector3::new(row(0), row(1), row(2))
     }
 
     /// The pose after a small rotation vector on the left and a shift of the projection centre:

@@ -3,13 +3,14 @@
 use nalgebra::Matrix3;
 use rayon::prelude::*;
 
+use super::block::{Block, BlockProjector, LANES};
 use super::camera::MAX_PARAMS;
 use super::pose::skew_matrix;
 use super::view::View;
 use crate::error::{Error, Result};
 
-/// Points per task: their inputs and outputs fit the inner caches.
-const BLOCK: usize = 4096;
+/// Points per task of the scheduler.
+const TASK: usize = 32 * LANES;
 
 /// World points to pixels and depths. What the camera cannot see is NaN in both.
 pub fn project(view: &View, xyz: &[[f64; 3]]) -> (Vec<[f64; 2]>, Vec<f64>) {
@@ -34,10 +35,16 @@ pub fn project_into(view: &View, xyz: &[[f64; 3]], xy: &mut [[f64; 2]], depth: &
 }
 
 fn fill(view: &View, xyz: &[[f64; 3]], xy: &mut [[f64; 2]], depth: &mut [f64]) {
-    xyz.par_chunks(BLOCK).zip(xy.par_chunks_mut(BLOCK)).zip(depth.par_chunks_mut(BLOCK)).for_each(
+    let projector = BlockProjector::new(view);
+    xyz.par_chunks(TASK).zip(xy.par_chunks_mut(TASK)).zip(depth.par_chunks_mut(TASK)).for_each(
         |((points, xy), depth)| {
-            for ((p, xy), d) in points.iter().zip(xy).zip(depth) {
-                (*xy, *d) = view.project(p).unwrap_or(([f64::NAN; 2], f64::NAN));
+            let mut block = Block::new();
+            for ((points, xy), depth) in points.chunks(LANES).zip(xy.chunks_mut(LANES)).zip(depth.chunks_mut(LANES)) {
+                projector.project(points, &mut block);
+                for (i, (xy, d)) in xy.iter_mut().zip(depth).enumerate() {
+                    *xy = [block.x[i], block.y[i]];
+                    *d = block.depth[i];
+                }
             }
         },
     );

@@ -60,7 +60,6 @@ impl<'py, T: Element> Input<'py, T> {
     }
 
     /// The shape.
-    #[allow(dead_code, reason = "for wrappers of images, whose height and width are read here")]
     pub fn shape(&self) -> &[usize] {
         self.0.shape()
     }

@@ -1,8 +1,10 @@
 //! The Python module `colourreg_rs._core`: a list of what it holds. Wrappers only; the work is done in the core.
 
 mod arrays;
+mod colour;
 mod errors;
 mod geometry;
+mod render;
 
 use pyo3::prelude::*;
 
@@ -12,5 +14,7 @@ fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add("debug_build", cfg!(debug_assertions))?;
     errors::register(m)?;
     geometry::register(m)?;
+    render::register(m)?;
+    colour::register(m)?;
     Ok(())
 }

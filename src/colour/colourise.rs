@@ -1,0 +1,165 @@
+//! Colours for a chunk of points from all photos that see them.
+
+use rayon::prelude::*;
+
+use super::blending::{Blend, Sample};
+use super::sampling::{Interpolation, Photo, rounded};
+use super::visibility::{Sight, VisibilityMap};
+use crate::error::{Error, Result};
+use crate::geometry::LANES;
+
+/// Points per task of the scheduler.
+const TASK: usize = 16 * LANES;
+
+/// Photos with what they see, ready to colour any number of chunks. What a point gets depends on that point alone.
+pub struct Colourist<'a> {
+    maps: Vec<&'a VisibilityMap>,
+    photos: Vec<Photo<'a>>,
+    gains: Option<Vec<[f32; 3]>>,
+    interpolation: Interpolation,
+    blend: Blend,
+}
+
+/// Where the results go: one row for each point.
+pub struct Colours<'a> {
+    /// 16 bit; untouched where no photo sees the point.
+    pub rgb: &'a mut [[u16; 3]],
+    /// The number of the photo, from 1, that gave the colour or the largest part of it; 0 where none sees the point.
+    pub source: &'a mut [u16],
+}
+
+impl<'a> Colourist<'a> {
+    /// From maps and photos in the same order, and gains for each photo and channel.
+    pub fn new(
+        maps: Vec<&'a VisibilityMap>,
+        photos: Vec<Photo<'a>>,
+        gains: Option<&[[f64; 3]]>,
+        interpolation: Interpolation,
+        blend: Blend,
+    ) -> Result<Self> {
+        if maps.is_empty() || maps.len() >= usize::from(u16::MAX) {
+            return Err(Error::invalid(format!("{} photos cannot colour points: give 1 to 65534", maps.len())));
+        }
+        if maps.len() != photos.len() || gains.is_some_and(|gains| gains.len() != maps.len()) {
+            return Err(Error::invalid(format!(
+                "{} maps, {} photos and {} gains do not belong together",
+                maps.len(),
+                photos.len(),
+                gains.map_or(maps.len(), <[_]>::len)
+            )));
+        }
+        for (i, (map, photo)) in maps.iter().zip(&photos).enumerate() {
+            let camera = &map.view().camera;
+            if (photo.width(), photo.height()) != (camera.width as usize, camera.height as usize) {
+                return Err(Error::invalid(format!(
+                    "photo {} has {} × {} pixels, its camera {} × {}",
+                    i + 1,
+                    photo.width(),
+                    photo.height(),
+                    camera.width,
+                    camera.height
+                )));
+            }
+        }
+        if let Some(gain) = gains.and_then(|gains| gains.iter().flatten().find(|g| !(g.is_finite() && **g > 0.0))) {
+            return Err(Error::invalid(format!("a gain of {gain} is not possible")));
+        }
+        let gains = gains.map(|gains| gains.iter().map(|gain| gain.map(|g| g as f32)).collect());
+        Ok(Self { maps, photos, gains, interpolation, blend })
+    }
+
+    /// Colours points; with normals (in the world frame) the best views are chosen by them.
+    pub fn colour(&self, xyz: &[[f64; 3]], normals: Option<&[[f64; 3]]>, colours: Colours<'_>) -> Result<()> {
+        let Colours { rgb, source } = colours;
+        if rgb.len() != xyz.len() || source.len() != xyz.len() || normals.is_some_and(|n| n.len() != xyz.len()) {
+            return Err(Error::invalid(format!(
+                "{} points do not fit {} colours, {} sources and {} normals",
+                xyz.len(),
+                rgb.len(),
+                source.len(),
+                normals.map_or(xyz.len(), <[_]>::len)
+            )));
+        }
+        let tasks = xyz.par_chunks(TASK).zip(rgb.par_chunks_mut(TASK)).zip(source.par_chunks_mut(TASK)).enumerate();
+        tasks.for_each(|(task, ((points, rgb), source))| {
+            source.fill(0);
+            let meeting: Vec<usize> = (0..self.maps.len()).filter(|&v| self.maps[v].meets(points)).collect();
+            if meeting.is_empty() {
+                return;
+            }
+            let normals = normals.map(|normals| &normals[task * TASK..][..points.len()]);
+            let mut scratch = Scratch { sight: Sight::new(), samples: vec![Vec::new(); LANES] };
+            let blocks = points.chunks(LANES).zip(rgb.chunks_mut(LANES)).zip(source.chunks_mut(LANES)).enumerate();
+            for (k, ((points, rgb), source)) in blocks {
+                if self.maps.len() == 1 {
+                    self.colour_by_one(0, points, &mut scratch.sight, rgb, source);
+                } else {
+                    let normals = normals.map(|normals| &normals[k * LANES..][..points.len()]);
+                    self.colour_by_several(&meeting, points, normals, &mut scratch, rgb, source);
+                }
+            }
+        });
+        Ok(())
+    }
+
+    #[inline(always)]
+    fn sample(&self, view: usize, xy: [f64; 2]) -> [f32; 3] {
+        let colour = self.photos[view].sample(xy, self.interpolation);
+        match &self.gains {
+            Some(gains) => std::array::from_fn(|k| (colour[k] * gains[view][k]).min(65535.0)),
+            None => colour,
+        }
+    }
+
+    fn colour_by_one(
+        &self,
+        view: usize,
+        points: &[[f64; 3]],
+        sight: &mut Sight,
+        rgb: &mut [[u16; 3]],
+        source: &mut [u16],
+    ) {
+        self.maps[view].look(points, sight);
+        for (i, (rgb, source)) in rgb.iter_mut().zip(source).enumerate() {
+            if sight.cell(i).is_some() {
+                *rgb = rounded(self.sample(view, sight.xy(i)));
+                *source = view as u16 + 1;
+            }
+        }
+    }
+
+    fn colour_by_several(
+        &self,
+        views: &[usize],
+        points: &[[f64; 3]],
+        normals: Option<&[[f64; 3]]>,
+        scratch: &mut Scratch,
+        rgb: &mut [[u16; 3]],
+        source: &mut [u16],
+    ) {
+        let Scratch { sight, samples } = scratch;
+        samples.iter_mut().for_each(Vec::clear);
+        for &view in views {
+            let map = self.maps[view];
+            map.look(points, sight);
+            for (i, (p, samples)) in points.iter().zip(samples.iter_mut()).enumerate() {
+                if let Some(cell) = sight.cell(i) {
+                    let xy = sight.xy(i);
+                    let weight = map.weight(p, xy, cell, normals.map(|n| &n[i]));
+                    samples.push(Sample { view, weight, colour: self.sample(view, xy) });
+                }
+            }
+        }
+        for ((samples, rgb), source) in samples.iter().zip(rgb).zip(source) {
+            if let Some((colour, view)) = self.blend.blend(samples) {
+                *rgb = rounded(colour);
+                *source = view as u16 + 1;
+            }
+        }
+    }
+}
+
+struct Scratch {
+    sight: Sight,
+    samples: Vec<Vec<Sample>>,
+}

@@ -1,0 +1,322 @@
+//! Depth buffers: the nearest point in each pixel.
+//!
+//! A cell keeps the largest *inverse* depth that was put into it (of a plane it is an affine function of the undistorted
+//! pixel position), merged by an atomic maximum: the order of the points, their chunks and the threads cannot be seen
+//! in the result, and adding may go on from several threads at once. An [`IndexBuffer`] keeps the point's index beside
+//! it, and of equal depths the lower index.
+
+use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
+
+use rayon::prelude::*;
+
+use crate::error::{Error, Result};
+use crate::geometry::{Block, BlockProjector, Frustum, LANES, Model, View};
+
+/// Points per task of the scheduler.
+const TASK: usize = 16 * LANES;
+/// How far ahead of its use a cell is fetched.
+const AHEAD: usize = 24;
+/// The widest band around the photo, pixels, that is kept too: what hides a point at the border may lie beyond it.
+const MAX_MARGIN: usize = 32;
+/// Cells beside the grid that are always there, so that neighbours can be asked for without looking.
+pub(super) const PAD: usize = 2;
+/// The largest inverse depth: what is nearer counts as this near, and sums stay finite.
+const NEAREST: f64 = 1e30;
+/// Where a point is not in the grid.
+const NOWHERE: u32 = u32::MAX;
+
+/// The cells of a buffer: the photo's pixels, a margin around them, and a rim of [`PAD`] empty ones.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Grid {
+    /// The photo's, pixels.
+    pub width: usize,
+    /// The photo's, pixels.
+    pub height: usize,
+    /// Cells beyond the photo's border, on all four sides.
+    pub margin: usize,
+    /// Whether the left and the right border are the same place.
+    pub wraps: bool,
+}
+
+impl Grid {
+    /// The grid for a view; refused where the machine could not count its cells.
+    pub fn new(view: &View) -> Result<Self> {
+        let (width, height) = (view.camera.width as usize, view.camera.height as usize);
+        let wraps = view.camera.model() == Model::Equirectangular;
+        let margin = if wraps { 0 } else { MAX_MARGIN.min(width.max(height) / 16) };
+        let grid = Self { width, height, margin, wraps };
+        if grid.stride().saturating_mul(grid.rows()) >= NOWHERE as usize {
+            return Err(Error::invalid(format!(
+                "a photo of {width} × {height} pixels is too large for a depth buffer; make it smaller"
+            )));
+        }
+        Ok(grid)
+    }
+
+    /// Cells in a row, with margins and rim.
+    pub fn stride(&self) -> usize {
+        self.width + 2 * (self.margin + PAD)
+    }
+
+    /// Rows, with margins and rim.
+    pub fn rows(&self) -> usize {
+        self.height + 2 * (self.margin + PAD)
+    }
+
+    /// Cells, with margins and rim.
+    pub fn len(&self) -> usize {
+        self.stride() * self.rows()
+    }
+
+    /// A grid without a cell; there is none.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// The cell of a pixel of the photo.
+    #[inline(always)]
+    pub fn cell(&self, column: usize, row: usize) -> usize {
+        (row + self.margin + PAD) * self.stride() + column + self.margin + PAD
+    }
+
+    /// The photo's part of a buffer's row.
+    pub fn photo_row<'a, T>(&self, cells: &'a [T], row: usize) -> &'a [T] {
+        let start = self.cell(0, row);
+        &cells[start..start + self.width]
+    }
+
+    #[inline(always)]
+    fn locate_here(&self, block: &Block, margin: usize, cells: &mut Located) {
+        let (low, offset) = (-0.5 - margin as f64, (self.margin + PAD) as f64 + 0.5);
+        let (right, below) = ((self.width + margin) as f64 - 0.5, (self.height + margin) as f64 - 0.5);
+        let (last_x, last_y) = (
+            (self.width + self.margin + PAD + margin - 1) as f64,
+            (self.height + self.margin + PAD + margin - 1) as f64,
+        );
+        let stride = self.stride() as u32;
+        for i in 0..LANES {
+            let (x, y, depth) = (block.x[i], block.y[i], block.depth[i]);
+            let inside = (x >= low) & (x < right) & (y >= low) & (y < below);
+            // The sum may round up to the next cell, which must not lie beyond the last.
+            let column = if inside { (x + offset).min(last_x) } else { 0.0 };
+            let row = if inside { (y + offset).min(last_y) } else { 0.0 };
+            // SAFETY: both are positive and below 2³², as the grid was checked at birth.
+            let (column, row) =
+                unsafe { (column.to_int_unchecked::<i32>() as u32, row.to_int_unchecked::<i32>() as u32) };
+            cells.cell[i] = if inside { row * stride + column } else { NOWHERE };
+            cells.inverse[i] = if inside { (1.0 / depth).min(NEAREST) as f32 } else { 0.0 };
+        }
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    unsafe fn locate_avx2(&self, block: &Block, margin: usize, cells: &mut Located) {
+        self.locate_here(block, margin, cells);
+    }
+
+    /// The cells of a block of projected points, as far as they lie in the photo widened by `margin`.
+    pub fn locate(&self, block: &Block, margin: usize, cells: &mut Located) {
+        #[cfg(target_arch = "x86_64")]
+        if std::arch::is_x86_feature_detected!("avx2") {
+            // SAFETY: the processor has the feature.
+            unsafe { self.locate_avx2(block, margin, cells) };
+            return;
+        }
+        self.locate_here(block, margin, cells);
+    }
+}
+
+/// Where the points of a block fall.
+#[repr(align(64))]
+pub struct Located {
+    cell: [u32; LANES],
+    inverse: [f32; LANES],
+}
+
+impl Located {
+    /// Room for a block.
+    pub fn new() -> Self {
+        Self { cell: [NOWHERE; LANES], inverse: [0.0; LANES] }
+    }
+
+    /// The cell and inverse depth of a point; `None` beside the grid.
+    #[inline(always)]
+    pub fn get(&self, i: usize) -> Option<(usize, f32)> {
+        (self.cell[i] != NOWHERE).then_some((self.cell[i] as usize, self.inverse[i]))
+    }
+
+    /// The cell of a point that follows some way behind this one, to be fetched.
+    #[inline(always)]
+    pub(crate) fn ahead(&self, i: usize) -> u32 {
+        self.cell[(i + AHEAD) % LANES]
+    }
+
+    /// Takes a point out.
+    #[inline(always)]
+    pub fn drop(&mut self, i: usize) {
+        self.cell[i] = NOWHERE;
+    }
+}
+
+impl Default for Located {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+/// Asks the memory for a cell that will be needed soon.
+#[inline(always)]
+pub(crate) fn fetch<T>(cells: &[T], cell: u32) {
+    #[cfg(target_arch = "x86_64")]
+    if let Some(cell) = cells.get(cell as usize) {
+        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
+        // SAFETY: a reference is a valid address, and fetching changes nothing.
+        unsafe { _mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(cell).cast()) };
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = (cells, cell);
+}
+
+/// Calls `put(cell, inverse depth, index)` for every point that the grid holds, in parallel.
+fn scatter<T: Sync>(view: &View, grid: &Grid, cells: &[T], xyz: &[[f64; 3]], put: impl Fn(&T, f32, usize) + Sync) {
+    let (projector, frustum) = (BlockProjector::new(view), Frustum::new(view, grid.margin as f64));
+    xyz.par_chunks(TASK).enumerate().filter(|(_, points)| frustum.meets(points)).for_each(|(task, points)| {
+        let (mut block, mut located) = (Block::new(), Located::new());
+        for (k, points) in points.chunks(LANES).enumerate() {
+            projector.project(points, &mut block);
+            grid.locate(&block, grid.margin, &mut located);
+            let first = task * TASK + k * LANES;
+            for i in 0..points.len() {
+                fetch(cells, located.ahead(i));
+                if let Some(cell) = cells.get(located.cell[i] as usize) {
+                    put(cell, located.inverse[i], first + i);
+                }
+            }
+        }
+    });
+}
+
+/// A cell that is empty when all its bits are zero.
+///
+/// # Safety
+/// All bits zero has to be a valid value.
+unsafe trait Zeroed {}
+// SAFETY: they are integers.
+unsafe impl Zeroed for AtomicU32 {}
+// SAFETY: they are integers.
+unsafe impl Zeroed for AtomicU64 {}
+
+/// Empty cells. The system hands out zeros, so that nothing is touched before it is needed, and then by all threads.
+fn empty_cells<T: Zeroed>(n: usize) -> Result<Vec<T>> {
+    let refused =
+        || Error::invalid(format!("there is no memory for a depth buffer of {} MB", n * size_of::<T>() / 1_000_000));
+    let layout = std::alloc::Layout::array::<T>(n).map_err(|_| refused())?;
+    if layout.size() == 0 {
+        return Ok(Vec::new());
+    }
+    // SAFETY: the layout is not empty; the memory is of the global allocator, of this layout, and zeros are valid.
+    unsafe {
+        let memory = std::alloc::alloc_zeroed(layout).cast::<T>();
+        if memory.is_null() { Err(refused()) } else { Ok(Vec::from_raw_parts(memory, n, n)) }
+    }
+}
+
+/// The nearest depth in each pixel.
+pub struct DepthBuffer {
+    view: View,
+    grid: Grid,
+    /// Inverse depths as bits: of positive numbers these are in the numbers' order. 0 where empty.
+    cells: Vec<AtomicU32>,
+}
+
+impl DepthBuffer {
+    /// An empty buffer.
+    pub fn new(view: View) -> Result<Self> {
+        let grid = Grid::new(&view)?;
+        let cells = empty_cells(grid.len())?;
+        Ok(Self { view, grid, cells })
+    }
+
+    /// Puts points in. May be called from several threads at once, in any order.
+    pub fn add(&self, xyz: &[[f64; 3]]) {
+        scatter(&self.view, &self.grid, &self.cells, xyz, |cell, inverse, _| {
+            let bits = inverse.to_bits();
+            if cell.load(Ordering::Relaxed) < bits {
+                cell.fetch_max(bits, Ordering::Relaxed);
+            }
+        });
+    }
+
+    /// The view.
+    pub fn view(&self) -> &View {
+        &self.view
+    }
+
+    /// How its cells lie.
+    pub fn grid(&self) -> Grid {
+        self.grid
+    }
+
+    /// The inverse depths, 0 where empty.
+    pub fn into_inverse_depth(self) -> Vec<f32> {
+        self.cells.into_iter().map(|cell| f32::from_bits(cell.into_inner())).collect()
+    }
+}
+
+/// The nearest depth in each pixel, and the index of the point that has it.
+pub struct IndexBuffer {
+    view: View,
+    grid: Grid,
+    /// Inverse depth above, the complement of the index below: the larger is the nearer, then the lower index.
+    cells: Vec<AtomicU64>,
+}
+
+impl IndexBuffer {
+    /// An empty buffer.
+    pub fn new(view: View) -> Result<Self> {
+        let grid = Grid::new(&view)?;
+        let cells = empty_cells(grid.len())?;
+        Ok(Self { view, grid, cells })
+    }
+
+    /// Puts points in, of which the first has the given index in its cloud. May be called from several threads at
+    /// once, in any order. Refused from 2³² − 1 points on.
+    pub fn add(&self, xyz: &[[f64; 3]], first: u64) -> Result<()> {
+        if first + xyz.len() as u64 > u64::from(u32::MAX) {
+            return Err(Error::invalid(format!("an index buffer holds {} points at most", u32::MAX)));
+        }
+        scatter(&self.view, &self.grid, &self.cells, xyz, |cell, inverse, i| {
+            let index = (first + i as u64) as u32;
+            let bits = u64::from(inverse.to_bits()) << 32 | u64::from(!index);
+            if inverse > 0.0 && cell.load(Ordering::Relaxed) < bits {
+                cell.fetch_max(bits, Ordering::Relaxed);
+            }
+        });
+        Ok(())
+    }
+
+    /// The view.
+    pub fn view(&self) -> &View {
+        &self.view
+    }
+
+    /// How its cells lie.
+    pub fn grid(&self) -> Grid {
+        self.grid
+    }
+
+    /// The inverse depths, 0 where empty, as a [`DepthBuffer`] of the same points has them.
+    pub fn inverse_depth(&self) -> Vec<f32> {
+        self.cells.par_iter().map(|c| f32::from_bits((c.load(Ordering::Relaxed) >> 32) as u32)).collect()
+    }
+
+    /// The photo's pixels, row by row: depth (NaN where empty) and index (`None` where empty).
+    pub fn pixels(&self) -> impl Iterator<Item = (f32, Option<u32>)> + '_ {
+        (0..self.grid.height).flat_map(|row| self.grid.photo_row(&self.cells, row)).map(|cell| {
+            match cell.load(Ordering::Relaxed) {
+                0 => (f32::NAN, None),
+                bits => (1.0 / f32::from_bits((bits >> 32) as u32), Some(!(bits as u32))),
+            }
+        })
+    }
+}

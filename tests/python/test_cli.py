@@ -1,0 +1,144 @@
+"""The command line: exit codes, one-line errors, and the same results as the API."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from colourreg_rs import Camera, ControlPoint, PointCloud, Pose, View, _core
+from colourreg_rs.io.clouds import open_cloud, read_cloud, write_cloud
+from colourreg_rs.io.images import write_image
+from colourreg_rs.io.points import write_points
+from colourreg_rs.io.registration import read_registration, write_camera
+
+CAMERA = Camera("OPENCV", 600, 400, {"fx": 500.0, "fy": 500.0, "cx": 299.5, "cy": 199.5, "k1": -0.04})
+POSE = Pose.looking_at([500_000.0, 5_800_000.0, 102.0], [500_001.0, 5_800_010.0, 103.0])
+
+
+def colourreg(*arguments: object, cwd=None) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "colourreg_rs.cli", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, timeout=300)
+
+
+@pytest.fixture(scope="module")
+def job(tmp_path_factory):
+    """A wall with a step before a camera: scan, photo, camera, control and check points."""
+    folder = tmp_path_factory.mktemp("job")
+    rng = np.random.default_rng(5)
+    view = View("photo", None, CAMERA, POSE)
+    u, v = rng.uniform(-8, 8, 60_000), rng.uniform(-4, 6, 60_000)
+    xyz = np.stack([500_001 + u, np.where(u > 1, 5_800_009.0, 5_800_011.0), 102 + v], 1)
+    write_cloud(folder / "scan.laz", PointCloud(xyz, intensity=rng.integers(0, 60_000, len(xyz)).astype(np.uint16)))
+    yy, xx = np.mgrid[0:400, 0:600]
+    write_image(folder / "photo.png", np.stack([xx % 256, yy % 256, (xx + yy) % 256], 2).astype(np.uint8))
+    write_camera(folder / "camera.json", CAMERA)
+    xy, _ = _core.project(view.core, xyz)
+    inside = np.flatnonzero((xy > 20).all(1) & (xy < [580, 380]).all(1))[:16]
+    points = [
+        ControlPoint(f"T{i}", xyz[k], xy[k] + rng.normal(0, 0.2, 2), "control" if i < 12 else "check")
+        for i, k in enumerate(inside)
+    ]
+    write_points(folder / "points.csv", points)
+    return folder
+
+
+def test_register_colourise_evaluate(job):
+    done = colourreg(
+        "register", "scan.laz", "photo.png", "--points", "points.csv", "--camera", "camera.json",
+        "--out", "registration.json", "--json", "register.json", cwd=job,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "wrote registration.json" in done.stdout and "at the object" in done.stdout
+    view = read_registration(job / "registration.json").views[0]
+    assert np.linalg.norm(view.pose.centre - POSE.centre) < 0.05
+    assert json.loads((job / "register.json").read_text())["trusted"] is True
+
+    done = colourreg("evaluate", "registration.json", "--json", "evaluate.json", cwd=job)
+    assert done.returncode == 0, done.stderr
+    (evaluation,) = json.loads((job / "evaluate.json").read_text())
+    assert evaluation["control"]["n"] == 12 and evaluation["check"]["n"] == 4
+    assert evaluation["check"]["rmse"] < 1.0
+
+    done = colourreg("colorize", "scan.laz", "registration.json", "--out", "coloured.laz", "--json", "c.json", cwd=job)
+    assert done.returncode == 0, done.stderr
+    result = json.loads((job / "c.json").read_text())
+    before, after = read_cloud(job / "scan.laz"), read_cloud(job / "coloured.laz")
+    assert np.array_equal(before.xyz, after.xyz) and np.array_equal(before.intensity, after.intensity)
+    with open_cloud(job / "coloured.laz") as cloud:
+        source = np.concatenate([chunk.columns()["ColourSource"] for chunk in cloud.chunks()])
+    assert (source > 0).sum() == result["coloured"] > 10_000
+    # A point's colour tells its pixel: red is the column, green the row.
+    xy, _ = _core.project(view.core, after.xyz)
+    plain = (source > 0) & (np.abs(xy % 256 - 128) < 100).all(1)
+    assert np.abs(after.rgb[plain, :2] / 256 - xy[plain] % 256).max() < 0.01
+    assert (after.rgb[source == 0] == 0).all()
+
+
+def test_dlt(job):
+    done = colourreg(
+        "register", "scan.laz", "photo.png", "--points", "points.csv", "--method", "dlt", "--distortion", "k1",
+        "--out", "dlt.json", cwd=job,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    view = read_registration(job / "dlt.json").views[0]
+    assert view.dlt is not None and view.size == (600, 400)
+
+
+def test_info(job):
+    done = colourreg("info", "scan.laz", "photo.png", "camera.json", "points.csv", "--json", "info.json", cwd=job)
+    assert done.returncode == 0, done.stderr
+    kinds = [d["kind"] for d in json.loads((job / "info.json").read_text())]
+    assert kinds == ["cloud", "photo", "camera", "points"]
+    assert "points: 60000" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "file", "problem"),
+    [
+        (["info", "absent.laz"], "absent.laz", "no such file"),
+        (["register", "scan.laz", "absent.png", "--points", "points.csv", "--out", "x.json"], "absent.png", "does not exist"),
+        (["register", "scan.laz", "photo.png", "--points", "camera.json", "--out", "x.json"], "camera.json", ""),
+        (["register", "scan.laz", "photo.png", "--out", "x.json"], "", "--points"),
+        (["colourise", "scan.laz", "camera.json", "--out", "x.laz"], "camera.json", "format"),
+        (["colourise", "photo.png", "registration.json", "--out", "x.laz"], "photo.png", ""),
+        (["colourise", "scan.laz", "registration.json", "--out", "scan.laz"], "scan.laz", "input"),
+        (["colourise", "scan.laz", "registration.json", "--out", "absent/x.laz"], "x.laz", "folder"),
+        (["colourise", "scan.laz", "registration.json", "--out", "x.xyz"], "x.xyz", ""),
+        (["evaluate", "points.csv"], "points.csv", "JSON"),
+    ],
+)
+def test_bad_data_is_one_line_and_exit_code_1(job, arguments, file, problem):
+    before = sorted(job.iterdir())
+    done = colourreg(*arguments, cwd=job)
+    assert done.returncode == 1
+    assert done.stderr.startswith("colourreg: ") and done.stderr.count("\n") == 1
+    assert file in done.stderr and problem in done.stderr
+    assert sorted(job.iterdir()) == before
+
+
+def test_a_registration_of_another_place_is_refused_and_nothing_is_written(job):
+    content = json.loads((job / "registration.json").read_text())
+    content["views"][0]["pose"]["translation"][0] += 5000.0
+    (job / "elsewhere.json").write_text(json.dumps(content))
+    done = colourreg("colourise", "scan.laz", "elsewhere.json", "--out", "elsewhere.laz", cwd=job)
+    assert done.returncode == 1 and "none of its points lies in any photo" in done.stderr
+    assert not (job / "elsewhere.laz").exists()
+
+
+def test_wrong_usage_is_exit_code_2(job):
+    for arguments in (["colourise"], ["no-such-command"], ["register", "a", "b", "--out", "c", "--method", "magic"]):
+        assert colourreg(*arguments, cwd=job).returncode == 2
+    assert colourreg("--version").stdout.startswith("colourreg ")
+
+
+def test_import_stays_light():
+    code = (
+        "import sys, colourreg_rs; heavy = {'pydantic', 'typer', 'rich', 'matplotlib', 'tifffile', 'pyproj', 'jinja2', 'scipy'};"
+        "print(sorted(heavy & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 from ._core import __version__
 from .errors import (
     ColourregError,
@@ -13,8 +15,36 @@ from .errors import (
 )
 from .model import Camera, ControlPoint, Covariance, PointCloud, Pose, Registration, View
 
+if TYPE_CHECKING:
+    from .colourise import ColouriseOptions, Colouriser, colourise_file
+    from .evaluate import evaluate_view
+    from .io.clouds import read_cloud, write_cloud
+    from .io.images import read_photo
+    from .io.points import read_points
+    from .io.registration import read_camera, read_registration, write_registration
+    from .register import RegisterOptions, register_photo
+
+#: The workflow and the files, imported when first used: `import colourreg_rs` stays as quick as numpy's.
+_LATER = {
+    "ColouriseOptions": "colourise",
+    "Colouriser": "colourise",
+    "RegisterOptions": "register",
+    "colourise_file": "colourise",
+    "evaluate_view": "evaluate",
+    "read_camera": "io.registration",
+    "read_cloud": "io.clouds",
+    "read_photo": "io.images",
+    "read_points": "io.points",
+    "read_registration": "io.registration",
+    "register_photo": "register",
+    "write_cloud": "io.clouds",
+    "write_registration": "io.registration",
+}
+
 __all__ = [
     "Camera",
+    "ColouriseOptions",
+    "Colouriser",
     "ColourregError",
     "ControlPoint",
     "Covariance",
@@ -25,7 +55,31 @@ __all__ = [
     "NotConvergedError",
     "PointCloud",
     "Pose",
+    "RegisterOptions",
     "Registration",
     "View",
     "__version__",
+    "colourise_file",
+    "evaluate_view",
+    "read_camera",
+    "read_cloud",
+    "read_photo",
+    "read_points",
+    "read_registration",
+    "register_photo",
+    "write_cloud",
+    "write_registration",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    module = _LATER.get(name)
+    if module is None:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib import import_module
+
+    return getattr(import_module(f".{module}", __name__), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

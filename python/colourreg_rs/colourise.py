@@ -174,9 +174,9 @@ def load_views(paths: Sequence[Path]) -> tuple[list[View], list[Photo]]:
 
 
 def colourise_file(
-    cloud: Path,
-    registrations: Sequence[Path],
-    out: Path,
+    cloud: str | Path,
+    registrations: Sequence[str | Path],
+    out: str | Path,
     *,
     options: ColouriseOptions | None = None,
     progress: Progress = silent,
@@ -187,8 +187,9 @@ def colourise_file(
     place or frame, and calling its result coloured would be wrong.
     """
     options = options or ColouriseOptions()
+    cloud, out = Path(cloud), Path(out)
     with open_cloud(cloud) as reader, create_cloud(out, like=reader) as writer:
-        views, photos = load_views(registrations)
+        views, photos = load_views([Path(path) for path in registrations])
         colouriser = Colouriser(views, [photo.pixels for photo in photos], options)
         low, high = _first_pass(reader, colouriser, progress)
         coloured, counts, sigmas = _second_pass(reader, writer, colouriser, progress)

@@ -129,12 +129,12 @@ def with_photo_sizes(registration: Registration, path: Path) -> Registration:
 
 
 def register_photo(
-    cloud: Path,
-    photo: Path,
+    cloud: str | Path,
+    photo: str | Path,
     *,
-    points: Path | None = None,
-    init: Path | None = None,
-    camera: Path | None = None,
+    points: str | Path | None = None,
+    init: str | Path | None = None,
+    camera: str | Path | None = None,
     options: RegisterOptions | None = None,
 ) -> RegisterResult:
     """Estimates the view of a photo from control points in the frame of a cloud.
@@ -143,17 +143,19 @@ def register_photo(
     the view.
     """
     options = options or RegisterOptions()
+    cloud, photo = Path(cloud), Path(photo)
     info = photo_info(photo)
     if points is None:
         raise InvalidInputError(
             f"method {options.method} needs control points: give a table with the columns name,X,Y,Z,x,y with --points"
         )
+    points = Path(points)
     control = read_points(points)
     with open_cloud(cloud) as reader:
         crs_wkt = reader.crs_wkt
         warnings = _outside(control, reader, points)
     _check_photo_coordinates(control, info, points)
-    start = _starting_view(photo, info, init, camera)
+    start = _starting_view(photo, info, Path(init) if init else None, Path(camera) if camera else None)
     try:
         if options.method == "dlt":
             result = _by_dlt(photo, info, control, options)

@@ -160,7 +160,7 @@ def load_views(paths: Sequence[Path]) -> tuple[list[View], list[Photo]]:
             if view.image is None:
                 raise FileError(path, f"view {view.name!r} names no photo", "give its image")
             photo = read_photo(view.image)
-            size = (photo.info.width, photo.info.height)
+            size = (photo.width, photo.height)
             if view.image_size is not None and view.image_size != size:
                 wanted = "{} x {}".format(*view.image_size)
                 raise FileError(

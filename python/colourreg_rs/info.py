@@ -27,7 +27,17 @@ def describe(path: Path) -> dict[str, Any]:
     if suffix in PHOTO_SUFFIXES:
         from .io.images import photo_info
 
-        return {"file": str(path), "kind": "photo", **photo_info(path).as_dict()}
+        photo = photo_info(path)
+        return {
+            "file": str(path),
+            "kind": "photo",
+            "format": photo.format,
+            "width": photo.width,
+            "height": photo.height,
+            "bits": photo.bits,
+            "mode": photo.mode,
+            "exif": dict(photo.exif),
+        }
     from .io.clouds import open_cloud
 
     with open_cloud(path) as cloud:

@@ -204,7 +204,7 @@ def _starting_view(photo: Path, info: PhotoInfo, init: Path | None, camera: Path
                 "use the calibration of this photo's own size and orientation",
             )
         return _Start(known, pose, calibrated, origin)
-    focal = info.focal_px
+    focal = info.exif.get("focal_px")
     origin = f"focal length {focal:.0f} px from EXIF" if focal else "focal length unknown"
     f = focal or ORDINARY_FOCAL * max(info.width, info.height)
     params = {"fx": f, "fy": f, "cx": (info.width - 1) / 2, "cy": (info.height - 1) / 2}

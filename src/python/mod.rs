@@ -1,7 +1,9 @@
 //! The Python module `colourreg_rs._core`: a list of what it holds. Wrappers only; the work is done in the core.
 
 mod arrays;
+mod codecs;
 mod errors;
+mod files;
 mod geometry;
 
 use pyo3::prelude::*;
@@ -11,6 +13,8 @@ fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add("__version__", env!("CARGO_PKG_VERSION"))?;
     m.add("debug_build", cfg!(debug_assertions))?;
     errors::register(m)?;
+    codecs::register(m)?;
+    files::register(m)?;
     geometry::register(m)?;
     Ok(())
 }

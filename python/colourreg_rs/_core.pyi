@@ -180,3 +180,29 @@ class Exposure:
 
     def gains(self) -> FloatArray:
         """(V, 3), one for each photo and channel; 1 for a photo that shares no points with others."""
+def scaled_xyz(records: npt.NDArray[np.uint8], scale: FloatArray, offset: FloatArray) -> FloatArray:
+    """Coordinates (N, 3) of LAS point records (N, L), L >= 12: the three little-endian 32-bit integers at the start of
+    each row, times ``scale`` (3,), plus ``offset`` (3,). Raises InvalidInputError for shorter rows."""
+
+def patch_records(
+    records: npt.NDArray[np.uint8],
+    split: int,
+    gap: int,
+    columns: list[tuple[int, npt.NDArray[np.uint8]]],
+    out: npt.NDArray[np.uint8],
+) -> None:
+    """Copies rows of bytes (N, L) into ``out`` (N, M): ``gap`` zero bytes are opened at byte ``split``, rows are
+    filled up with zeros to M bytes, and each column (place in the new row, (N, w) bytes) is written over the result.
+    Raises InvalidInputError where sizes do not fit."""
+
+def lzf_decompress(data: npt.NDArray[np.uint8], size: int) -> npt.NDArray[np.uint8]:
+    """Decompresses an LZF stream into exactly ``size`` bytes. Raises InvalidInputError when the stream is broken or
+    holds more or less."""
+
+def decode_png(data: npt.NDArray[np.uint8], max_pixels: int) -> npt.NDArray[np.uint16]:
+    """A PNG with 16 bits a channel as (H, W, C) uint16, C = 1 to 4 (grey, grey + alpha, RGB, RGBA); interlaced too.
+    Raises InvalidInputError when it is broken, has another depth, or more than ``max_pixels`` pixels."""
+
+def decode_lzw(data: npt.NDArray[np.uint8], size: int) -> npt.NDArray[np.uint8]:
+    """The first ``size`` bytes of a strip or tile of a TIFF that is compressed with LZW. Raises InvalidInputError when
+    the stream is broken or ends before."""

@@ -100,6 +100,11 @@ impl<'py, T: Element> Output<'py, T> {
         typed.try_readwrite().map(Self).map_err(|e| PyValueError::new_err(format!("{name}: {e}")))
     }
 
+    /// The shape.
+    pub fn shape(&self) -> &[usize] {
+        self.0.shape()
+    }
+
     /// All values in C order.
     pub fn values(&mut self) -> PyResult<&mut [T]> {
         self.0.as_slice_mut().map_err(|e| PyValueError::new_err(e.to_string()))

@@ -1,8 +1,10 @@
 //! The Python module `colourreg_rs._core`: a list of what it holds. Wrappers only; the work is done in the core.
 
 mod arrays;
+mod codecs;
 mod colour;
 mod errors;
+mod files;
 mod geometry;
 mod render;
 
@@ -13,6 +15,8 @@ fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add("__version__", env!("CARGO_PKG_VERSION"))?;
     m.add("debug_build", cfg!(debug_assertions))?;
     errors::register(m)?;
+    codecs::register(m)?;
+    files::register(m)?;
     geometry::register(m)?;
     render::register(m)?;
     colour::register(m)?;

@@ -47,7 +47,7 @@ def draw_cloud(
     size: int = 2,
     background: tuple[int, int, int] = (24, 26, 30),
 ) -> Image:
-    """The coloured points as the view sees them, near ones over far ones."""
+    """The coloured points as the view sees them, near ones over far ones, as squares that about close the surfaces."""
     assert view.image_size is not None
     width, height = view.image_size
     picture = np.empty((height, width, 3), np.uint8)
@@ -55,6 +55,8 @@ def draw_cloud(
     xy, depth = _core.project(view.core, np.ascontiguousarray(xyz))
     with np.errstate(invalid="ignore"):
         inside = (xy >= -0.5).all(1) & (xy < np.array([width, height]) - 0.5).all(1)
+    if size is None:
+        size = int(np.clip(np.ceil(1.5 * np.sqrt(width * height / max(1, inside.sum()))), 1, 6))
     _splat(picture, xy[inside], depth[inside], as_8_bit(rgb[inside]), size)
     return picture
 
@@ -70,7 +72,7 @@ def _splat(picture: Image, xy: FloatArray, depth: FloatArray, colours: Image, si
 
 def bird_view(xyz: FloatArray, view: View, *, width: int = 1600, height: int = 1000) -> View:
     """A view from above and beside the photo's own place, towards the middle of what the photo shows."""
-    xy, depth = _core.project(view.core, np.ascontiguousarray(xyz))
+    xy, _ = _core.project(view.core, np.ascontiguousarray(xyz))
     assert view.image_size is not None
     with np.errstate(invalid="ignore"):
         inside = (xy >= -0.5).all(1) & (xy < np.array(view.image_size) - 0.5).all(1)

@@ -180,6 +180,7 @@ class Exposure:
 
     def gains(self) -> FloatArray:
         """(V, 3), one for each photo and channel; 1 for a photo that shares no points with others."""
+
 def scaled_xyz(records: npt.NDArray[np.uint8], scale: FloatArray, offset: FloatArray) -> FloatArray:
     """Coordinates (N, 3) of LAS point records (N, L), L >= 12: the three little-endian 32-bit integers at the start of
     each row, times ``scale`` (3,), plus ``offset`` (3,). Raises InvalidInputError for shorter rows."""
@@ -206,3 +207,48 @@ def decode_png(data: npt.NDArray[np.uint8], max_pixels: int) -> npt.NDArray[np.u
 def decode_lzw(data: npt.NDArray[np.uint8], size: int) -> npt.NDArray[np.uint8]:
     """The first ``size`` bytes of a strip or tile of a TIFF that is compressed with LZW. Raises InvalidInputError when
     the stream is broken or ends before."""
+
+class SimulatedScene:
+    """A scene of exact primitives with procedural materials under sun and sky, in its own frame (metres, z up)."""
+
+    def __init__(
+        self,
+        primitives: FloatArray,
+        primitive_materials: npt.NDArray[np.int64],
+        materials: FloatArray,
+        layers: FloatArray,
+        paintings: list[npt.NDArray[np.uint8]],
+        lighting: FloatArray,
+    ) -> None:
+        """From tables. ``primitives`` (N, 12): outline, origin, u, v, surface coordinates of the origin;
+        ``primitive_materials`` (N,); ``materials`` (M, 8): number of layers, gloss, translucency, relief height and
+        wavelength, emission; ``layers`` (L, 16): pattern, colour (4), amount, scale (3), seed, parameters (6), those of
+        each material in turn; ``paintings``: (H, W, 5) images (sRGB, near infrared, opacity); ``lighting`` (21,): see
+        ``simulate.lighting``. Raises InvalidInputError with the entry that is impossible."""
+
+    def __len__(self) -> int:
+        """How many primitives it has."""
+
+    def light(self) -> None:
+        """Gathers the light of sky, lamps and surfaces now rather than at the first picture."""
+
+    def cast(self, origin: FloatArray, rays: FloatArray) -> tuple[FloatArray, npt.NDArray[np.int32], FloatArray]:
+        """The first hit of rays (N, 3) from ``origin`` (3,): distance in units of the ray's length (N,; infinite for
+        none), primitive (N,; −1 for none), unit normal towards the origin's side (N, 3; zero for none)."""
+
+    def sees(self, origin: FloatArray, points: FloatArray, tolerance: float) -> npt.NDArray[np.bool_]:
+        """Whether nothing stands between ``origin`` (3,) and points (N, 3), but for the last ``tolerance`` metres."""
+
+    def reflectance(
+        self, points: FloatArray, primitives: npt.NDArray[np.int32], footprints: FloatArray
+    ) -> npt.NDArray[np.float32]:
+        """Linear red, green, blue and near-infrared reflectance (N, 4) at points (N, 3) of primitives (N,) under
+        footprints (N,) in metres; 0 where the primitive is −1."""
+
+    def picture(self, view: View, first_row: int, last_row: int, samples: int) -> npt.NDArray[np.float32]:
+        """Linear radiance (rows, width, 3) of the rows from ``first_row`` up to, not including, ``last_row``: the mean
+        over each pixel's area, of ``samples`` rays where there are edges; 0 where the lens shows nothing."""
+
+    def radiance_at(self, view: View, xy: FloatArray, sigma: float, own_surface: bool) -> npt.NDArray[np.float32]:
+        """Linear radiance (N, 3) at pixels (N, 2) through square pixels and a Gaussian lens blur of ``sigma`` pixels;
+        with ``own_surface`` of the primitive in the middle alone. NaN where the lens shows nothing."""

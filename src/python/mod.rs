@@ -7,6 +7,7 @@ mod errors;
 mod files;
 mod geometry;
 mod render;
+mod simulate;
 
 use pyo3::prelude::*;
 
@@ -20,5 +21,6 @@ fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     geometry::register(m)?;
     render::register(m)?;
     colour::register(m)?;
+    simulate::register(m)?;
     Ok(())
 }

@@ -1,0 +1,24 @@
+"""Simulated scans and photos with their truth: scenes that look real, ray-cast exactly, errors put in by hand."""
+
+from __future__ import annotations
+
+from .disturbance import Disturbance
+from .photo import Response, SimulatedPhoto
+from .scanner import Scanner, ScanTruth
+from .scene import Frame, Hits, Scene
+from .scenes import SCENES
+from .simulation import Simulation, simulate
+
+__all__ = [
+    "SCENES",
+    "Disturbance",
+    "Frame",
+    "Hits",
+    "Response",
+    "ScanTruth",
+    "Scanner",
+    "Scene",
+    "SimulatedPhoto",
+    "Simulation",
+    "simulate",
+]

@@ -1,0 +1,103 @@
+"""Scenes, rays and visibility of the simulator."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from colourreg_rs import _core
+from colourreg_rs.errors import InvalidInputError
+from colourreg_rs.simulate import Frame, Simulation, simulate
+
+
+@pytest.fixture(scope="module")
+def square() -> Simulation:
+    return simulate("square", seed=3, size=(360, 240), photos=1, points=60_000)
+
+
+def test_scan_points_lie_on_their_surfaces_up_to_the_stated_noise(square: Simulation) -> None:
+    truth = square.scan_truth
+    station = np.array(square.stations[0])
+    ranges = np.linalg.norm(square.scan.xyz - station, axis=1)
+    error = (ranges - np.linalg.norm(truth.surface - station, axis=1)) / truth.range_sigma
+    assert abs(error.mean()) < 0.02
+    assert abs(error.std() - 1.0) < 0.02
+    rays = truth.surface - station
+    hits = square.scene.cast(station, rays)
+    np.testing.assert_allclose(hits.distance, 1.0, atol=1e-9)
+    # Where two surfaces touch, rounding decides which one is met.
+    assert (hits.primitive != truth.primitive).mean() < 1e-3
+
+
+def test_without_noise_the_scan_is_the_truth() -> None:
+    clean = simulate("square", seed=3, photos=0, points=20_000, scanner=lambda s: s.without_noise())
+    np.testing.assert_allclose(clean.scan.xyz, clean.scan_truth.surface, atol=1e-9)
+
+
+def test_visibility_agrees_with_the_depth_image(square: Simulation) -> None:
+    photo = square.photos[0]
+    points = square.scan_truth.surface
+    visible = photo.visible(points)
+    depth, primitive = photo.depth_image
+    xy, _ = _core.project(photo.view.core, points)
+    inside = np.isfinite(xy[:, 0]) & (xy >= 0).all(axis=1) & (xy[:, 0] <= 359) & (xy[:, 1] <= 239)
+    assert not visible[~np.isfinite(xy[:, 0])].any()
+    columns, rows = np.round(xy[inside]).astype(int).T
+    # A pixel whose neighbourhood is one primitive sees just that one, but for what is thinner than a pixel.
+    padded = np.pad(primitive, 1, mode="edge")
+    neighbours = np.stack([padded[1 + a : 241 + a, 1 + b : 361 + b] for a in (-1, 0, 1) for b in (-1, 0, 1)])
+    even = (neighbours == primitive).all(axis=0)[rows, columns]
+    same = primitive[rows, columns] == square.scan_truth.primitive[inside]
+    assert even.sum() > 10_000
+    assert (visible[inside][even] != same[even]).mean() < 2e-3
+    distance = np.linalg.norm(points[inside] - photo.view.core.centre, axis=1)
+    seen = even & same
+    assert np.median(np.abs(distance[seen] - depth[rows, columns][seen]) / distance[seen]) < 0.005
+    assert 0.05 < 1 - visible[inside].mean() < 0.6, "the square is there to hide things"
+
+
+def test_the_same_seed_gives_the_same_bits_and_another_another_scene(square: Simulation) -> None:
+    again = simulate("square", seed=3, size=(360, 240), photos=1, points=60_000)
+    np.testing.assert_array_equal(again.scan.xyz, square.scan.xyz)
+    np.testing.assert_array_equal(again.photos[0].image, square.photos[0].image)
+    np.testing.assert_array_equal(again.photos[0].points[0].xy, square.photos[0].points[0].xy)
+    other = simulate("square", seed=4, photos=0, points=60_000)
+    assert len(other.scan) != len(square.scan)
+
+
+def test_the_options_do_not_change_the_scene(square: Simulation) -> None:
+    other = simulate("square", seed=3, size=(90, 60), photos=1, points=10_000)
+    assert other.scene.parts.rows == square.scene.parts.rows
+    np.testing.assert_array_equal(other.photos[0].start.pose.rotation, square.photos[0].start.pose.rotation)
+
+
+def test_a_georeferenced_frame_shows_the_same_picture(square: Simulation) -> None:
+    frame = Frame.turned(0.7, (500_000.0, 5_000_000.0, 100.0))
+    moved = simulate("square", seed=3, size=(360, 240), photos=1, points=60_000, frame=frame)
+    a, b = square.photos[0], moved.photos[0]
+    np.testing.assert_allclose(frame.to_scene(moved.scan.xyz), square.scan.xyz, atol=1e-7)
+    difference = np.abs(a.image.astype(int) - b.image.astype(int)).max(axis=2)
+    assert (difference > 3).mean() < 0.01
+    here, _ = _core.project(a.view.core, square.scan_truth.surface)
+    there, _ = _core.project(b.view.core, moved.scan_truth.surface)
+    # The translation vector has seven digits before the point; what is left is its rounding.
+    np.testing.assert_allclose(there, here, atol=1e-4)
+    np.testing.assert_array_equal(
+        a.visible(square.scan_truth.surface[:5000]), b.visible(moved.scan_truth.surface[:5000])
+    )
+
+
+def test_near_infrared_is_not_the_visible(square: Simulation) -> None:
+    truth = square.scan_truth
+    names = np.array(square.scene.objects)[truth.object]
+    leaves = np.isin(names, ["tree", "shrub"]) & (truth.reflectance[:, 3] > 0.5)
+    assert leaves.sum() > 50
+    visible = truth.reflectance[leaves, :3].mean(axis=1)
+    assert (truth.reflectance[leaves, 3] > 2.5 * visible).mean() > 0.95
+
+
+def test_what_does_not_exist_is_refused_in_one_line() -> None:
+    with pytest.raises(InvalidInputError, match="no scene 'moon'; choose one of"):
+        simulate("moon")
+    with pytest.raises(InvalidInputError, match="2 viewpoints, 9 photos wanted"):
+        simulate("square", photos=9, points=10)

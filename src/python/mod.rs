@@ -2,6 +2,7 @@
 
 mod arrays;
 mod errors;
+mod estimation;
 mod geometry;
 
 use pyo3::prelude::*;
@@ -12,5 +13,6 @@ fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add("debug_build", cfg!(debug_assertions))?;
     errors::register(m)?;
     geometry::register(m)?;
+    estimation::register(m)?;
     Ok(())
 }

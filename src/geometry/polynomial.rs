@@ -71,6 +71,25 @@ impl Polynomial {
         [x * g + p1 * xy2 + p2 * (r2 + 2.0 * x * x), y * g + p1 * (r2 + 2.0 * y * y) + p2 * xy2]
     }
 
+    /// As [`Polynomial::distort`], with d(xd, yd)/d(x, y), which is symmetric: (xx, xy, yy).
+    #[inline(always)]
+    pub fn distort_with_slope(&self, x: f64, y: f64) -> Option<([f64; 2], [f64; 3])> {
+        let r2 = x * x + y * y;
+        if !(r2 <= self.max_r2) {
+            return None;
+        }
+        let [k1, k2, p1, p2, k3, k4, k5, k6] = self.k;
+        let per_denominator = 1.0 / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)));
+        let g = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) * per_denominator;
+        let dg = (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3) - g * (k4 + r2 * (2.0 * k5 + r2 * 3.0 * k6))) * per_denominator;
+        let (px, py) = (2.0 * (p1 * x + p2 * y), 2.0 * (p1 * y + p2 * x));
+        let xd = x * g + p1 * 2.0 * x * y + p2 * (r2 + 2.0 * x * x);
+        let yd = y * g + p1 * (r2 + 2.0 * y * y) + p2 * 2.0 * x * y;
+        let slope =
+            [g + 2.0 * x * x * dg + py + 4.0 * p2 * x, 2.0 * x * y * dg + px, g + 2.0 * y * y * dg + py + 4.0 * p1 * y];
+        Some(([xd, yd], slope))
+    }
+
     pub fn derivatives(&self, x: f64, y: f64) -> Derivatives {
         let [k1, k2, p1, p2, k3, k4, k5, k6] = self.k;
         let r2 = x * x + y * y;

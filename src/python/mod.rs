@@ -4,6 +4,7 @@ mod arrays;
 mod codecs;
 mod colour;
 mod errors;
+mod estimation;
 mod files;
 mod geometry;
 mod render;
@@ -22,5 +23,6 @@ fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     render::register(m)?;
     colour::register(m)?;
     simulate::register(m)?;
+    estimation::register(m)?;
     Ok(())
 }

@@ -252,3 +252,88 @@ class SimulatedScene:
     def radiance_at(self, view: View, xy: FloatArray, sigma: float, own_surface: bool) -> npt.NDArray[np.float32]:
         """Linear radiance (N, 3) at pixels (N, 2) through square pixels and a Gaussian lens blur of ``sigma`` pixels;
         with ``own_surface`` of the primitive in the middle alone. NaN where the lens shows nothing."""
+
+class DltResult:
+    """A DLT matrix with its residuals, covariance and verdict. Immutable."""
+
+    @property
+    def view(self) -> View: ...
+    @property
+    def matrix(self) -> FloatArray:
+        """(3, 4), scaled so that ‖(h31 h32 h33)‖ = 1 and det M > 0: the third row times (X, 1) is the depth."""
+
+    @property
+    def parameters(self) -> list[str]:
+        """h11 … h34 and the distortion terms: the order of ``covariance``."""
+
+    @property
+    def covariance(self) -> FloatArray:
+        """A posteriori covariance of ``parameters``; singular in the direction of the scale."""
+
+    @property
+    def part_parameters(self) -> list[str]:
+        """rx ry rz cx_world cy_world cz_world fx fy cx cy, skew, distortion: the order of ``part_covariance``."""
+
+    @property
+    def part_covariance(self) -> FloatArray: ...
+    @property
+    def sigma0(self) -> float: ...
+    @property
+    def dof(self) -> float: ...
+    @property
+    def residuals(self) -> FloatArray:
+        """(N, 2) projected minus measured, pixels."""
+
+    @property
+    def status(self) -> list[str]:
+        """For each point ``used``, ``check`` or ``not visible``."""
+
+    @property
+    def rms(self) -> float: ...
+    @property
+    def rms_x(self) -> float: ...
+    @property
+    def rms_y(self) -> float: ...
+    @property
+    def rmse(self) -> float: ...
+    @property
+    def check_rms(self) -> float: ...
+    @property
+    def check_rmse(self) -> float: ...
+    @property
+    def iterations(self) -> int: ...
+    @property
+    def stop(self) -> str | None: ...
+    @property
+    def thickness(self) -> float:
+        """Smallest extent of the control points over the largest."""
+
+    @property
+    def gap(self) -> float:
+        """Last singular value of the normalised equations over the last but one: 0 is exact, 1 undetermined."""
+
+    @property
+    def border_error(self) -> float: ...
+    @property
+    def centre_error(self) -> float: ...
+    @property
+    def verdict(self) -> Verdict: ...
+
+def estimate_dlt(
+    xyz: FloatArray,
+    xy: FloatArray,
+    width: int,
+    height: int,
+    *,
+    method: int = 11,
+    distortion: list[str] = ...,
+    sigma_xy: float | FloatArray | None = None,
+    check: npt.NDArray[np.bool_] | None = None,
+) -> DltResult:
+    """Direct Linear Transformation from control points (N, 3), world, and their pixels (N, 2).
+
+    ``method`` 11: h34 = 1 in the frame of the centroid, iterated, then Levenberg-Marquardt on the image residuals; 12: the
+    smallest singular vector of the normalised equations. ``distortion``: any of k1 k2 p1 p2 k3, as in
+    :meth:`View.dlt`. ``sigma_xy``: pixels, (N, 2) or (N, 2, 2) covariances. ``check``: points that take no part. Raises
+    InvalidInputError for too few points or a left-handed frame, DegenerateError for points in one plane or otherwise
+    undetermined, NotConvergedError. Source: Abdel-Aziz and Karara 1971; Hartley and Zisserman, chapter 7."""

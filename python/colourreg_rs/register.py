@@ -287,9 +287,7 @@ def _by_resection(
         unknown = not start.calibrated and "focal length unknown" in start.origin
         result = _core.resect_robust(given.core, xyz, xy, seed=options.seed, unknown_focal=unknown, **common)
     core = result.view
-    camera = replace(
-        start.camera, params=dict(zip(start.camera.params, core.params.tolist(), strict=True))
-    )
+    camera = replace(start.camera, params=dict(zip(start.camera.params, core.params.tolist(), strict=True)))
     view = View(
         name=photo.stem,
         image=photo,
@@ -333,3 +331,46 @@ def _statistics(result: Any) -> dict[str, float]:
     """What is known of the fit; figures that do not exist (no redundancy) are left out."""
     figures = {name: float(getattr(result, name)) for name in ("sigma0", "dof", "rms", "rms_x", "rms_y", "rmse")}
     return {name: value for name, value in figures.items() if np.isfinite(value)}
+
+
+def _by_dlt(photo: Path, info: PhotoInfo, control: Sequence[ControlPoint], options: RegisterOptions) -> RegisterResult:
+    """Direct Linear Transformation: nothing is known of the camera, and every point is believed."""
+    unknown = sorted(set(options.distortion) - set(DLT_DISTORTION_NAMES))
+    if unknown:
+        raise InvalidInputError(
+            f"a DLT has no distortion term {', '.join(unknown)}; it takes {', '.join(DLT_DISTORTION_NAMES)}"
+        )
+    result = _core.estimate_dlt(
+        np.stack([p.xyz for p in control]),
+        np.stack([p.xy for p in control]),
+        info.width,
+        info.height,
+        method=options.dlt_parameters,
+        distortion=list(options.distortion),
+        sigma_xy=_sigmas(control, options.sigma_xy),
+        check=np.array([p.role == "check" for p in control]),
+    )
+    core = result.view
+    terms = dict(zip(("fx", "fy", "cx", "cy", *DLT_DISTORTION_NAMES), core.params.tolist(), strict=True))
+    view = View(
+        name=photo.stem,
+        image=photo,
+        dlt=result.matrix,
+        dlt_distortion={name: terms[name] for name in options.distortion},
+        size=(info.width, info.height),
+        covariance=_covariance(result),
+        method="dlt",
+        points=_judged(control, result),
+        statistics=_statistics(result),
+    )
+    parts = Covariance(tuple(result.part_parameters), result.part_covariance)
+    figures = {**{name: terms[name] for name in ("fx", "fy", "cx", "cy")}, "skew": core.skew}
+    return RegisterResult(
+        registration=Registration((view,)),
+        evaluation=evaluate_view(view),
+        notes=(f"DLT with {options.dlt_parameters} parameters; distortion: {', '.join(options.distortion) or 'none'}",),
+        warnings=tuple(w.message for w in result.verdict.warnings),
+        trusted=result.verdict.ok,
+        free=tuple(result.part_parameters),
+        facts={name: f"{value:.2f} ± {parts.sigma(name):.2f}" for name, value in figures.items()},
+    )

@@ -3,6 +3,8 @@
 mod batch;
 mod blunders;
 mod collinearity;
+mod dlt;
+mod dlt_linear;
 mod fit;
 mod levenberg;
 mod loss;
@@ -18,6 +20,7 @@ mod start;
 mod verdict;
 
 pub use blunders::Criterion;
+pub use dlt::{Dlt, DltMethod, DltOptions, estimate_dlt};
 pub use levenberg::Stop;
 pub use loss::Loss;
 pub use observations::{Observations, Precision};

@@ -14,7 +14,7 @@ use crate::estimation::{
 use crate::geometry::View;
 
 /// A scalar, (N, 2) sigmas, or (N, 2, 2) covariances.
-fn precision(sigma_xy: Option<&Bound<'_, PyAny>>) -> PyResult<Option<Precision>> {
+pub(super) fn precision(sigma_xy: Option<&Bound<'_, PyAny>>) -> PyResult<Option<Precision>> {
     let Some(given) = sigma_xy else { return Ok(None) };
     if let Ok(sigma) = given.extract::<f64>()
         && !given.is_instance_of::<PyBool>()
@@ -39,7 +39,7 @@ fn start(name: &str) -> PyResult<Start> {
     })
 }
 
-fn square<'py>(py: Python<'py>, m: &DMatrix<f64>) -> PyResult<Bound<'py, PyArray2<f64>>> {
+pub(super) fn square<'py>(py: Python<'py>, m: &DMatrix<f64>) -> PyResult<Bound<'py, PyArray2<f64>>> {
     // Symmetric: the order of the elements does not matter.
     owned(py, m.as_slice().to_vec(), [m.nrows(), m.ncols()])
 }

@@ -3,6 +3,7 @@
 mod arrays;
 mod codecs;
 mod colour;
+mod dlt;
 mod errors;
 mod estimation;
 mod files;
@@ -24,5 +25,6 @@ fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     colour::register(m)?;
     simulate::register(m)?;
     estimation::register(m)?;
+    dlt::register(m)?;
     Ok(())
 }

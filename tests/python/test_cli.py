@@ -73,7 +73,8 @@ def test_register_colourise_evaluate(job):
     assert (source > 0).sum() == result["coloured"] > 10_000
     # A point's colour tells its pixel: red is the column, green the row.
     xy, _ = _core.project(view.core, after.xyz)
-    plain = (source > 0) & (np.abs(xy % 256 - 128) < 100).all(1)
+    # Not where the ramps wrap, nor in the outermost half pixel, which repeats the border.
+    plain = (source > 0) & (np.abs(xy % 256 - 128) < 100).all(1) & (xy > 0).all(1) & (xy < [599, 399]).all(1)
     assert np.abs(after.rgb[plain, :2] / 256 - xy[plain] % 256).max() < 0.01
     assert (after.rgb[source == 0] == 0).all()
 

@@ -217,14 +217,14 @@ class PlyWriter(PlyOutput):
         self._copy(self._source.end, self._source.size - self._source.end)
 
     def _copy(self, start: int, size: int) -> None:
-        file = self._source.file
-        file.seek(start)
-        while size > 0:
-            data = file.read(min(size, _COPY))
-            if not data:
-                raise FileError(self._source.path, "became shorter meanwhile", "start again with a file at rest")
-            self._file.write(data)
-            size -= len(data)
+        with self._source.open() as file:
+            file.seek(start)
+            while size > 0:
+                data = file.read(min(size, _COPY))
+                if not data:
+                    raise FileError(self._source.path, "became shorter meanwhile", "start again with a file at rest")
+                self._file.write(data)
+                size -= len(data)
 
 
 class PlyConverter(PlyOutput):

@@ -69,6 +69,9 @@ impl Frustum {
                 high[k] = if p[k] > high[k] { p[k] } else { high[k] };
             }
         }
+        if low[0] > high[0] || low[1] > high[1] || low[2] > high[2] {
+            return false;
+        }
         let (low, high) = (Vector3::from(low) - self.centre, Vector3::from(high) - self.centre);
         self.inward.iter().all(|n| (0..3).map(|k| (n[k] * low[k]).max(n[k] * high[k])).sum::<f64>() > 0.0)
     }

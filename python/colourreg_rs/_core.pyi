@@ -115,7 +115,7 @@ class DepthBuffer:
         Raises InvalidInputError after :meth:`finish`."""
 
     def finish(self) -> VisibilityMap:
-        """The frozen map; the buffer goes into it and takes no more points. Raises InvalidInputError if called twice."""
+        """The frozen map; the buffer goes into it and takes no more. Raises InvalidInputError if called twice."""
 
 class IndexBuffer:
     """The nearest point in each pixel of a view, and its index; of equal depths the lower index."""
@@ -163,11 +163,11 @@ def colour_points(
     """Colours (N, 3) for points (N, 3) from photos (H, W, 3), and the number of the photo that gave each, from 1; 0
     where no photo sees the point.
 
-    8-bit photos give their values times 256, interpolated values keep their fraction. ``sampling`` is bilinear or bicubic
-    (Keys, a = −1/2). ``blend`` is best (the best view: pixels per area of the surface, less at the photo's border and
-    beside depth edges), mean (weighted) or median (weighted geometric median; with two photos the better). ``gains``
-    (V, 3) multiply the photos' channels; ``normals`` (N, 3), world frame, are used in the weights in place of those of
-    the depth buffer. Given ``out_rgb`` and ``out_source`` are written into; rgb of points that no photo sees is left as it
+    8-bit photos give their values times 256, interpolated values keep their fraction. ``sampling`` is bilinear or
+    bicubic (Keys, a = −1/2). ``blend`` is best (the best view: pixels per area of the surface, less at the photo's
+    border and beside depth edges), mean (weighted) or median (weighted geometric median; with two photos the better).
+    ``gains`` (V, 3) multiply the photos' channels; ``normals`` (N, 3), world frame, are used in the weights in place of
+    those of the depth buffer. Given ``out_rgb`` and ``out_source`` are written into; rgb of unseen points is left as it
     is there. Points are independent of each other, so that chunks cannot be seen in the result. Raises
     InvalidInputError where photos and cameras differ in size."""
 

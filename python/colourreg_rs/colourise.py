@@ -201,7 +201,7 @@ def colourise_file(
         coloured=coloured,
         by_view={f"{i}: {view.name}": int(n) for i, (view, n) in enumerate(zip(views, counts, strict=True), start=1)},
         median_sigma=sigmas,
-        warnings=tuple(reader.warnings),
+        warnings=writer.warnings,
     )
 
 

@@ -199,12 +199,12 @@ def test_every_point_format(tmp_path, rng, form, suffix):
 @pytest.mark.parametrize("channels", [1, 3])
 def test_streams_of_compressed_blocks_are_exchanged(tmp_path, rng, form, channels):
     source, target = tmp_path / "in.laz", tmp_path / "out.laz"
-    make(source, form, rng, n=120_000, channels=channels, extra=form % 2 == 0)
+    make(source, form, rng, n=60_000, channels=channels, extra=form % 2 == 0)
     if channels > 1 and form >= 9:
         with pytest.raises(FileError, match="waveform packets of several scanner channels"):
             colour(source.with_suffix(".las"), target, rng)
         assert not target.exists()
-    assert_same_but_coloured(source, target, colour(source, target, rng, size=70_000))
+    assert_same_but_coloured(source, target, colour(source, target, rng, size=50_000))
     # Coloured again: the dimensions are there, and are overwritten.
     again = tmp_path / "again.laz"
     assert_same_but_coloured(target, again, colour(target, again, rng, size=100_000))
@@ -226,7 +226,7 @@ def test_only_what_is_given_is_added(tmp_path, rng, only, suffix):
 @pytest.mark.parametrize("form", [3, 7])
 def test_the_output_does_not_depend_on_the_chunk_size(tmp_path, pair, form):
     source = tmp_path / f"in{pair[0]}"
-    make(source, form, np.random.default_rng(1), n=120_000)
+    make(source, form, np.random.default_rng(1), n=60_000)
     outputs = []
     for size in (1_000_000, 50_000, 7_777):
         target = tmp_path / f"out-{size}{pair[1]}"
@@ -395,7 +395,7 @@ def test_damaged_bytes_never_end_in_anything_but_a_line(data_dir, tmp_path, rng,
     source, target = tmp_path / f"in{Path(name).suffix}", tmp_path / f"out{Path(name).suffix}"
     header = struct.unpack_from("<I", whole, 96)[0]
     refused = 0
-    for i in range(150):
+    for i in range(80):
         data = bytearray(whole)
         end = header + 60 if i % 3 else len(data)
         for at in rng.integers(4, end, rng.integers(1, 4)):
@@ -409,7 +409,7 @@ def test_damaged_bytes_never_end_in_anything_but_a_line(data_dir, tmp_path, rng,
             assert not target.exists()
         else:
             target.unlink()
-    assert refused >= 5
+    assert refused >= 3
 
 
 @pytest.mark.parametrize(

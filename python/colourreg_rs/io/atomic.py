@@ -139,6 +139,16 @@ def open_binary(path: str | Path) -> IO[bytes]:
         raise FileError(path, f"cannot be read: {detail}", None) from error
 
 
+def reopen(path: Path, first: IO[bytes]) -> IO[bytes]:
+    """The open file ``first`` once more, with a position of its own; refused when ``path`` is another file by now."""
+    file = open_binary(path)
+    a, b = os.fstat(first.fileno()), os.fstat(file.fileno())
+    if (a.st_dev, a.st_ino, a.st_size) != (b.st_dev, b.st_ino, b.st_size):
+        file.close()
+        raise FileError(path, "was replaced while it was read", "start again with a file at rest")
+    return file
+
+
 def read_bytes(path: str | Path, limit: int | None = None) -> bytes:
     """The whole content of a file, refused above ``limit`` bytes."""
     with reading(path) as file:

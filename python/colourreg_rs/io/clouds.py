@@ -186,7 +186,7 @@ class CloudWriter(ABC):
     left behind.
 
     Attributes:
-        warnings: what the output cannot keep of the input, one line each.
+        warnings: those of the input, and what the output cannot keep of it, one line each.
     """
 
     path: Path

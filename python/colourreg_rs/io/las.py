@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 import re
+import threading
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +16,7 @@ import numpy.typing as npt
 from .. import _core
 from ..errors import FileError
 from . import laz
-from .atomic import open_binary, reason
+from .atomic import open_binary, reason, reopen
 from .clouds import CHUNK_SIZE, AnyArray, Attribute, CloudChunk, CloudReader
 from .las_header import (
     RAISED,
@@ -38,6 +39,7 @@ class LasReader(CloudReader):
     def __init__(self, path: Path) -> None:
         self.path = path
         self._file = open_binary(path)
+        self._lock = threading.Lock()  # each iteration over the points has a file of its own, what else is read has not
         try:
             self._size = os.fstat(self._file.fileno()).st_size
             self.header = read_header(path, self._file, self._size)
@@ -89,7 +91,7 @@ class LasReader(CloudReader):
     def crs_wkt(self) -> str | None:  # cached, as pyproj takes its time
         record = self.header.find("LASF_Projection", 2112)
         if record is not None and record.length < 1 << 24:
-            text = load(self._file, record).split(b"\0")[0].decode("utf-8", "replace").strip()
+            text = self.load(record).split(b"\0")[0].decode("utf-8", "replace").strip()
             if re.match(r"[A-Za-z_]+\s*\[", text):  # some writers leave quotes or a word there
                 return text
         keys = self.header.find("LASF_Projection", 34735)
@@ -119,18 +121,19 @@ class LasReader(CloudReader):
     def chunks(self, size: int = CHUNK_SIZE, positions_only: bool = False) -> Iterator[CloudChunk]:
         size = max(1, int(size))
         try:
-            yield from self._chunks(size, positions_only)
+            with reopen(self.path, self._file) as file:
+                yield from self._chunks(file, size, positions_only)
         except OSError as error:
             raise FileError(self.path, f"cannot be read: {reason(error)}", None) from error
 
-    def _chunks(self, size: int, positions_only: bool) -> Iterator[LasChunk]:
+    def _chunks(self, file: IO[bytes], size: int, positions_only: bool) -> Iterator[LasChunk]:
         start = 0
         if self.laz is None:
             length = self.header.record_length
             while start < self.n_points:
                 count = min(size, self.n_points - start)
-                self._file.seek(self.header.point_offset + start * length)
-                records = np.fromfile(self._file, np.uint8, count * length)
+                file.seek(self.header.point_offset + start * length)
+                records = np.fromfile(file, np.uint8, count * length)
                 if len(records) < count * length:
                     raise FileError(self.path, f"ends after {start:,} points", "did somebody change it meanwhile?")
                 yield LasChunk(self, start, records.reshape(count, length), None)
@@ -138,7 +141,7 @@ class LasReader(CloudReader):
         elif self.laz.largest <= size and self.laz.table:
             layered = self.laz.scheme.layered
             selection = laz.POSITIONS if positions_only else laz.POSITIONS_AND_COLOUR
-            for block in self.laz.blocks(size):
+            for block in self.laz.blocks(file, size):
                 if layered:
                     yield LasChunk(self, start, self.laz.decode(block, selection), block, complete=False)
                 else:
@@ -146,7 +149,7 @@ class LasReader(CloudReader):
                 start += block.n_points
         else:
             selection = laz.POSITIONS if positions_only else laz.EVERYTHING
-            for records in self.laz.stream(size, selection):
+            for records in self.laz.stream(file, size, selection):
                 yield LasChunk(self, start, records, None)
                 start += len(records)
 
@@ -155,15 +158,17 @@ class LasReader(CloudReader):
 
     def read_at(self, position: int, size: int) -> bytes:
         """Bytes of the file, as they are."""
-        self._file.seek(position)
-        data = self._file.read(size)
+        with self._lock:
+            self._file.seek(position)
+            data = self._file.read(size)
         if len(data) < size:
             raise FileError(self.path, f"ends inside the {size:,} bytes at {position:,}", "copy the file again")
         return data
 
     def load(self, record: Record) -> bytes:
         """The data of a variable-length record."""
-        return load(self._file, record)
+        with self._lock:
+            return load(self._file, record)
 
     @property
     def points_end(self) -> int:

@@ -171,36 +171,35 @@ class LazSource:
 
     def __init__(self, path: Path, file: IO[bytes], size: int, header: LasHeader) -> None:
         self.path = path
-        self.file = file
         self.scheme = Scheme.parse(path, header)
         self.n_points = header.n_points
         self._points_at = header.point_offset
         self.length = header.record_length
         self.table: tuple[tuple[int, int], ...] = ()
         if self.scheme.compressor != _POINTWISE:
-            self.table = self._read_table(size)
+            self.table = self._read_table(file, size)
         self.largest = max((points for points, _ in self.table), default=self.n_points)
 
-    def _read_table(self, size: int) -> tuple[tuple[int, int], ...]:
+    def _read_table(self, file: IO[bytes], size: int) -> tuple[tuple[int, int], ...]:
         start, n, chunk_size = self._points_at + 8, self.n_points, self.scheme.chunk_size
-        self.file.seek(self._points_at)
-        at = int.from_bytes(self.file.read(8), "little", signed=True)
+        file.seek(self._points_at)
+        at = int.from_bytes(file.read(8), "little", signed=True)
         if at <= self._points_at and size >= 8:  # a writer that could not go back left it at the end
-            self.file.seek(size - 8)
-            at = int.from_bytes(self.file.read(8), "little", signed=True)
+            file.seek(size - 8)
+            at = int.from_bytes(file.read(8), "little", signed=True)
         if at < start or at + 8 > size:
             raise FileError(self.path, "has no table of its compressed blocks", "the file is truncated: copy it again")
-        self.file.seek(at + 4)
-        count = int.from_bytes(self.file.read(4), "little")
+        file.seek(at + 4)
+        count = int.from_bytes(file.read(4), "little")
         expected = -(-n // chunk_size) if not self.scheme.variable else None
         if (expected is not None and count != expected) or count > n:
             problem = f"announces {n:,} points, but has {count:,} compressed blocks"
             if not self.scheme.variable:
                 problem += f" of {chunk_size:,}"
             raise FileError(self.path, problem, "the file is truncated or broken: copy it again")
-        self.file.seek(self._points_at)
+        file.seek(self._points_at)
         with decoding(self.path):
-            table = [(int(p), int(b)) for p, b in lazrs.read_chunk_table(self.file, self.scheme.codec())]
+            table = [(int(p), int(b)) for p, b in lazrs.read_chunk_table(file, self.scheme.codec())]
         if not self.scheme.variable:
             table[-1] = (n - chunk_size * (count - 1), table[-1][1])
         points, held = sum(p for p, _ in table), sum(b for _, b in table)
@@ -209,7 +208,7 @@ class LazSource:
             raise FileError(self.path, problem, _BROKEN)
         return tuple(table)
 
-    def blocks(self, size: int) -> Iterator[Block]:
+    def blocks(self, file: IO[bytes], size: int) -> Iterator[Block]:
         """Groups of whole blocks of together at most ``size`` points, as they are stored."""
         position, first = self._points_at + 8, 0
         while first < len(self.table):
@@ -219,8 +218,8 @@ class LazSource:
                 last += 1
             table = self.table[first:last]
             held = sum(b for _, b in table)
-            self.file.seek(position)
-            data = np.fromfile(self.file, np.uint8, held)
+            file.seek(position)
+            data = np.fromfile(file, np.uint8, held)
             if len(data) < held:
                 raise FileError(self.path, "ends inside its compressed points", "the file is truncated: copy it again")
             block = Block(table, data)
@@ -249,15 +248,15 @@ class LazSource:
             )
         return records
 
-    def stream(self, size: int, selection: int) -> Iterator[Bytes]:
+    def stream(self, file: IO[bytes], size: int, selection: int) -> Iterator[Bytes]:
         """Records in order, ``size`` at a time, on one core: for blocks larger than a chunk may be."""
         if self.scheme.layered:
             for points, _ in self.table:
                 if points > 1 << 28:
                     raise FileError(self.path, f"has a compressed block of {points:,} points", "compress it again")
-        self.file.seek(self._points_at)
+        file.seek(self._points_at)
         with decoding(self.path):
-            source = lazrs.LasZipDecompressor(self.file, self.scheme.data, lazrs.DecompressionSelection(selection))
+            source = lazrs.LasZipDecompressor(file, self.scheme.data, lazrs.DecompressionSelection(selection))
         left = self.n_points
         while left:
             records = np.empty((min(size, left), self.length), np.uint8)

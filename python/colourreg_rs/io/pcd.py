@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from .. import _core
 from ..errors import FileError, InvalidInputError
-from .atomic import open_binary, reason
+from .atomic import open_binary, reason, reopen
 from .clouds import CHUNK_SIZE, AnyArray, Attribute, CloudChunk, CloudReader
 
 _TRUNCATED = "the file is truncated: copy it again"
@@ -173,24 +173,24 @@ class PcdReader(CloudReader):
 
     def chunks(self, size: int = CHUNK_SIZE, positions_only: bool = False) -> Iterator[PcdChunk]:
         size = max(1, int(size))
-        position, start = self._start, 0
+        start = 0
         try:
-            while start < self.n_points:
-                count = min(size, self.n_points - start)
-                self._file.seek(position)
-                if self.encoding == "ascii":
-                    columns = self._text(count, start)
-                elif self.encoding == "binary":
-                    columns = self._binary(count, start)
-                else:
-                    columns = self._compressed(count, start)
-                position = self._file.tell()
-                yield PcdChunk(self, start, columns)
-                start += count
+            with reopen(self.path, self._file) as file:
+                file.seek(self._start)
+                while start < self.n_points:
+                    count = min(size, self.n_points - start)
+                    if self.encoding == "ascii":
+                        columns = self._text(file, count, start)
+                    elif self.encoding == "binary":
+                        columns = self._binary(file, count, start)
+                    else:
+                        columns = self._compressed(file, count, start)
+                    yield PcdChunk(self, start, columns)
+                    start += count
         except OSError as error:
             raise FileError(self.path, f"cannot be read: {reason(error)}", None) from error
 
-    def _binary(self, count: int, start: int) -> dict[str, AnyArray]:
+    def _binary(self, file: IO[bytes], count: int, start: int) -> dict[str, AnyArray]:
         dtype = np.dtype(
             {
                 "names": list(self._by_name),
@@ -199,15 +199,15 @@ class PcdReader(CloudReader):
                 "itemsize": self.record_length,
             }
         )
-        rows = np.fromfile(self._file, dtype, count)
+        rows = np.fromfile(file, dtype, count)
         if len(rows) < count:
             raise FileError(self.path, f"ends after {start:,} points", "did somebody change it meanwhile?")
         return {name: np.ascontiguousarray(rows[name]) for name in self._by_name}
 
-    def _compressed(self, count: int, start: int) -> dict[str, AnyArray]:
+    def _compressed(self, file: IO[bytes], count: int, start: int) -> dict[str, AnyArray]:
         if self._columns is None:
-            self._file.seek(self._start + 8)
-            data = np.fromfile(self._file, np.uint8, self._packed_size)
+            file.seek(self._start + 8)
+            data = np.fromfile(file, np.uint8, self._packed_size)
             try:
                 self._columns = _core.lzf_decompress(data, self.n_points * self.record_length)
             except InvalidInputError as error:
@@ -219,12 +219,12 @@ class PcdReader(CloudReader):
             columns[f.name] = np.frombuffer(part.tobytes(), f.dtype).reshape(count, f.count)
         return columns
 
-    def _text(self, count: int, start: int) -> dict[str, AnyArray]:
+    def _text(self, file: IO[bytes], count: int, start: int) -> dict[str, AnyArray]:
         parts: list[dict[str, AnyArray]] = []
         done = 0
         while done < count:
-            lines = [line for line in itertools.islice(self._file, min(_ROWS, count - done)) if line.strip()]
-            if not lines and not self._file.peek(1)[:1]:  # type: ignore[attr-defined]  # a BufferedReader
+            lines = [line for line in itertools.islice(file, min(_ROWS, count - done)) if line.strip()]
+            if not lines and not file.peek(1)[:1]:  # type: ignore[attr-defined]  # a BufferedReader
                 problem = f"announces {self.n_points:,} points, but holds only {start + done:,}"
                 raise FileError(self.path, problem, _TRUNCATED)
             lines = [line.replace(b",", b" ") for line in lines]  # some programs put commas there

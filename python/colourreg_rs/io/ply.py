@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import FileError
-from .atomic import open_binary, reason
+from .atomic import open_binary, reason, reopen
 from .clouds import CHUNK_SIZE, AnyArray, Attribute, CloudChunk, CloudReader
 from .las_header import take
 from .ply_header import Element, PlyHeader, Property, read_header, row_of_text, skip_element
@@ -145,23 +145,23 @@ class PlyReader(CloudReader):
 
     def chunks(self, size: int = CHUNK_SIZE, positions_only: bool = False) -> Iterator[PlyChunk]:
         size = max(1, int(size))
-        position, start = self.start, 0
+        start = 0
         try:
-            while start < self.n_points:
-                self._file.seek(position)
-                count = min(size, self.n_points - start)
-                rows = self._text_rows(count, start) if self.header.text else self._rows(count, start)
-                position = self._file.tell()
-                yield PlyChunk(self, start, rows)
-                start += count
+            with reopen(self.path, self._file) as file:
+                file.seek(self.start)
+                while start < self.n_points:
+                    count = min(size, self.n_points - start)
+                    rows = self._text_rows(file, count, start) if self.header.text else self._rows(file, count, start)
+                    yield PlyChunk(self, start, rows)
+                    start += count
         except OSError as error:
             raise FileError(self.path, f"cannot be read: {reason(error)}", None) from error
 
-    def _rows(self, count: int, start: int) -> Rows:
+    def _rows(self, file: IO[bytes], count: int, start: int) -> Rows:
         """Binary rows; where they differ in length, each on its own."""
         order, vertex = self.header.order, self.vertex
         if not vertex.has_lists:
-            data = np.fromfile(self._file, np.uint8, count * vertex.least)
+            data = np.fromfile(file, np.uint8, count * vertex.least)
             if len(data) < count * vertex.least:
                 raise FileError(self.path, f"ends after {start:,} points", "did somebody change it meanwhile?")
             return FixedRows(vertex, order, data.reshape(count, -1))
@@ -170,19 +170,19 @@ class PlyReader(CloudReader):
             row = b""
             for p in vertex.properties:
                 width, repeat = np.dtype(p.counted or p.kind).itemsize, 1
-                head = self._file.read(width)
+                head = file.read(width)
                 row += head
                 if p.counted:
                     repeat = int(np.frombuffer(head, order + p.counted)[0])
-                    row += self._file.read(repeat * np.dtype(p.kind).itemsize)
+                    row += file.read(repeat * np.dtype(p.kind).itemsize)
             data_rows.append(row)
         return ListRows(vertex, order, data_rows)
 
-    def _text_rows(self, count: int, start: int) -> TextRows:
+    def _text_rows(self, file: IO[bytes], count: int, start: int) -> TextRows:
         lines: list[bytes] = []
         values: list[npt.NDArray[np.float64]] = []
         while len(lines) < count:
-            part = [line for line in itertools.islice(self._file, min(_ROWS, count - len(lines))) if line.strip()]
+            part = [line for line in itertools.islice(file, min(_ROWS, count - len(lines))) if line.strip()]
             values.append(self._parse(part, start + len(lines)))
             lines += part
         return TextRows(self.vertex, lines, np.concatenate(values))
@@ -216,10 +216,9 @@ class PlyReader(CloudReader):
     def close(self) -> None:
         self._file.close()
 
-    @property
-    def file(self) -> IO[bytes]:
-        """The open file."""
-        return self._file
+    def open(self) -> IO[bytes]:
+        """The file once more, with a position of its own."""
+        return reopen(self.path, self._file)
 
 
 class Rows:

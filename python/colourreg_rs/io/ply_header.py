@@ -102,7 +102,8 @@ class PlyHeader:
     @property
     def comments(self) -> tuple[str, ...]:
         """What follows the word ``comment``."""
-        return tuple(line[8:].strip() for line in self.lines if line.startswith("comment "))
+        found = (line[8:].strip() for line in self.lines if line.startswith("comment "))
+        return tuple(c.encode("utf-8", "surrogateescape").decode("utf-8", "replace") for c in found)
 
 
 def read_header(path: Path, file: IO[bytes]) -> PlyHeader:
@@ -119,7 +120,8 @@ def read_header(path: Path, file: IO[bytes]) -> PlyHeader:
         raise FileError(path, "ends with its header", _TRUNCATED)
     size = stop + len(newline)
     file.seek(size)
-    lines = head[:stop].decode("latin-1").split(newline)
+    # Bytes that are no UTF-8 survive the way in and out again.
+    lines = head[:stop].decode("utf-8", "surrogateescape").split(newline)
     order: str | None = None
     elements: list[tuple[str, int, list[Property]]] = []
     for number, line in enumerate(lines[1:-1], 2):
@@ -128,7 +130,7 @@ def read_header(path: Path, file: IO[bytes]) -> PlyHeader:
             case ["format", kind, *rest]:
                 order = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}.get(kind)
                 if order is None or rest != ["1.0"]:
-                    raise FileError(path, f"line {number}: {line.strip()!r} is not a PLY 1.0 format", "export it again")
+                    raise FileError(path, f"line {number}: {line.strip()!a} is not a PLY 1.0 format", "export it again")
             case ["element", name, count] if count.isdecimal() and len(count) < 16:
                 elements.append((name, int(count), []))
             case ["property", "list", counted, kind, name] if elements and _whole(counted) and kind in TYPES:
@@ -138,7 +140,7 @@ def read_header(path: Path, file: IO[bytes]) -> PlyHeader:
             case [] | ["comment" | "obj_info", *_]:
                 pass
             case _:
-                raise FileError(path, f"line {number}: {line.strip()[:80]!r} is not understood", "export it again")
+                raise FileError(path, f"line {number}: {line.strip()[:80]!a} is not understood", "export it again")
     if order is None:
         raise FileError(path, "has no line with its format", "export it again")
     if order == "" and newline == "\r":
@@ -148,7 +150,7 @@ def read_header(path: Path, file: IO[bytes]) -> PlyHeader:
         names = [p.name for p in element.properties]
         if len(set(names)) < len(names):
             twice = next(name for name in names if names.count(name) > 1)
-            raise FileError(path, f"has two properties {twice!r} in its element {element.name!r}", "rename one of them")
+            raise FileError(path, f"has two properties {twice!a} in its element {element.name!a}", "rename one of them")
     return PlyHeader(tuple(lines), newline, order, made, size)
 
 

@@ -110,6 +110,7 @@ class PlyWriter(PlyOutput):
 
     def __init__(self, path: Path, like: PlyReader) -> None:
         super().__init__(path, like)
+        self.warnings = like.warnings
         self._source: PlyReader = like
         self._puts: list[Put] = []
 
@@ -143,7 +144,7 @@ class PlyWriter(PlyOutput):
                 if words[-1] in renamed:  # the same name for something else: it stays, under another name
                     lines[i] = lines[i].rstrip() + "_before"
         lines[last + 1 : last + 1] = [f"property {NAMES[put.kind]} {put.name}" for put in self._puts if not put.exists]
-        self._file.write((header.newline.join(lines) + header.newline).encode("latin-1"))
+        self._file.write((header.newline.join(lines) + header.newline).encode("utf-8", "surrogateescape"))
         self._copy(header.size, self._source.start - header.size)
 
     def put(self, chunk: CloudChunk, rgb: AnyArray | None, source: AnyArray | None, sigma: AnyArray | None) -> None:
@@ -217,14 +218,14 @@ class PlyWriter(PlyOutput):
         self._copy(self._source.end, self._source.size - self._source.end)
 
     def _copy(self, start: int, size: int) -> None:
-        file = self._source.file
-        file.seek(start)
-        while size > 0:
-            data = file.read(min(size, _COPY))
-            if not data:
-                raise FileError(self._source.path, "became shorter meanwhile", "start again with a file at rest")
-            self._file.write(data)
-            size -= len(data)
+        with self._source.open() as file:
+            file.seek(start)
+            while size > 0:
+                data = file.read(min(size, _COPY))
+                if not data:
+                    raise FileError(self._source.path, "became shorter meanwhile", "start again with a file at rest")
+                self._file.write(data)
+                size -= len(data)
 
 
 class PlyConverter(PlyOutput):

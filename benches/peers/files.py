@@ -71,13 +71,15 @@ def laspy_recolour(folder: str, suffix: str) -> float:
     import laspy
 
     began = time.perf_counter()
-    with laspy.open(Path(folder, f"scan{suffix}")) as reader:
-        with laspy.open(Path(folder, f"peer{suffix}"), mode="w", header=reader.header) as writer:
-            for record in reader.chunk_iterator(CHUNK):
-                record.red[:] = record.intensity
-                record.green[:] = record.intensity
-                record.blue[:] = record.intensity
-                writer.write_points(record)
+    with (
+        laspy.open(Path(folder, f"scan{suffix}")) as reader,
+        laspy.open(Path(folder, f"peer{suffix}"), mode="w", header=reader.header) as writer,
+    ):
+        for record in reader.chunk_iterator(CHUNK):
+            record.red[:] = record.intensity
+            record.green[:] = record.intensity
+            record.blue[:] = record.intensity
+            writer.write_points(record)
     return time.perf_counter() - began
 
 

@@ -1,7 +1,7 @@
 """One measurement: every contender in a process of its own, in turn, so that all see the same machine.
 
 A contender is a function of this package that does its untimed preparation, then returns the seconds of the timed part.
-Its process's peak memory is what the operating system says of it; a run that only prepares gives the figure to subtract.
+Its process's peak memory is what the operating system says of it.
 """
 
 from __future__ import annotations

@@ -23,7 +23,6 @@ from .progress import Progress, silent
 from .register import RegisterOptions, register_photo
 from .simulate import Disturbance, SimulatedPhoto, Simulation, simulate
 
-
 IntArray = npt.NDArray[np.int64]
 
 #: Points that are compared with the truth; ray casting every one would take longer than the job itself.

@@ -50,7 +50,7 @@ def prefetched(items: Iterable[T], ahead: int = 1) -> Iterator[T]:
 
 
 class Behind(Generic[T]):
-    """Does ``work`` on items in a thread, in order, at most ``depth`` of them waiting. Errors surface at the next call."""
+    """``work`` on items in a thread, in order, at most ``depth`` of them waiting; errors surface at the next call."""
 
     def __init__(self, work: Callable[[T], None], depth: int = 1) -> None:
         self._work = work

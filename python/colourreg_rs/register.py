@@ -1,7 +1,7 @@
 """From where a photo was taken, and with what camera: a view from control points.
 
-What is known to begin with comes, in this order, from ``--camera`` (a calibration), from the view of a registration that
-one starts from, from the photo's EXIF, or from nothing at all. What is not known well is estimated with the pose.
+What is known to begin with comes, in this order, from ``--camera`` (a calibration), from the view of a registration to
+start from, from the photo's EXIF, or from nothing at all. What is not known well is estimated with the pose.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from . import _core
-from .errors import ColourregError, DegenerateError, FileError, InvalidInputError
+from .errors import DegenerateError, FileError, InvalidInputError
 from .evaluate import ViewEvaluation, evaluate_view, table
 from .io.clouds import open_cloud
 from .io.images import PhotoInfo, photo_info

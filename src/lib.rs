@@ -15,6 +15,7 @@ pub mod error;
 pub mod estimation;
 pub mod geometry;
 pub mod lzf;
+pub mod matching;
 pub mod records;
 pub mod render;
 pub mod simulate;

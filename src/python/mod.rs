@@ -6,7 +6,9 @@ mod colour;
 mod errors;
 mod files;
 mod geometry;
+mod matching;
 mod render;
+mod render_sci;
 mod simulate;
 
 use pyo3::prelude::*;
@@ -20,7 +22,9 @@ fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     files::register(m)?;
     geometry::register(m)?;
     render::register(m)?;
+    render_sci::register(m)?;
     colour::register(m)?;
     simulate::register(m)?;
+    matching::register(m)?;
     Ok(())
 }

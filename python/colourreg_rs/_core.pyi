@@ -4,6 +4,8 @@ Frames: *world* is the cloud's frame; the *camera* frame is x right, y down, z f
 the top-left pixel. Angles are radians. A wrong dtype raises ``TypeError``, a wrong shape ``ValueError``.
 """
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
@@ -128,6 +130,170 @@ class IndexBuffer:
 
     def images(self) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]:
         """Depth (H, W), NaN where empty, and index (H, W), −1 where empty."""
+
+def sci_front(
+    buffer: IndexBuffer, *, hide: bool = True, tolerance: float | None = None, max_gap: float | None = None
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    """The points of a buffer that no surface hides: index (H, W), -1 where there is none; inverse depth (H, W), 0
+    likewise; and limit (H, W): whatever has a smaller inverse depth here is hidden, 0 where nothing hides. Without
+    ``hide`` every pixel keeps its nearest point. ``tolerance`` and ``max_gap`` as in :class:`DepthBuffer`."""
+
+def sci_gather(
+    view: View,
+    index: npt.NDArray[np.int64],
+    station: FloatArray,
+    xyz: FloatArray,
+    *,
+    first: int = 0,
+    intensity: npt.NDArray[np.float32] | None = None,
+    normals: FloatArray | None = None,
+    offset: npt.NDArray[np.float32],
+    value: npt.NDArray[np.float32],
+    range: npt.NDArray[np.float32],
+    cosine: npt.NDArray[np.float32],
+) -> None:
+    """Looks up those points of ``index`` (H, W) that are in this chunk (N, 3), the first of which is number ``first``.
+
+    Written into: ``offset`` (H, W, 2), the point's true place from the pixel's centre, px; ``value`` (H, W), its
+    intensity; ``range`` (H, W), its distance from ``station`` (3,), world; ``cosine`` (H, W) of the incidence there.
+    Other pixels are left as they are. Raises InvalidInputError where sizes do not fit."""
+
+def sci_fill(
+    inverse_depth: npt.NDArray[np.float32],
+    limit: npt.NDArray[np.float32],
+    *,
+    width: int = 8,
+    tolerance: float = 0.006,
+    wraps: bool = False,
+) -> npt.NDArray[np.float32]:
+    """Fills holes (zeros) of the inverse depths (H, W) up to ``width`` px wide between neighbours on one surface: the
+    slope across the hole has to lie between the slopes beside it, up to ``tolerance`` of the depth. Never behind
+    ``limit``."""
+
+def sci_resample(
+    values: npt.NDArray[np.float32],
+    offset: npt.NDArray[np.float32],
+    inverse_depth: npt.NDArray[np.float32],
+    *,
+    sigma: float = 0.7,
+    widest: float = 4.0,
+) -> npt.NDArray[np.float32]:
+    """Values (H, W) of points that lie ``offset`` (H, W, 2) beside their pixels' centres, brought to the centres of all
+    pixels with an inverse depth: a plane through the neighbours at their true places, weighted by a Gaussian of
+    ``sigma`` px, twice as wide where none is near, up to ``widest``. NaN elsewhere."""
+
+def fit_exponents(
+    intensity: npt.NDArray[np.float32], range: npt.NDArray[np.float32], cosine: npt.NDArray[np.float32] | None = None
+) -> tuple[float, float]:
+    """The powers of range (-2.5 to 0) and of the cosine of incidence (0 to 1.5) that intensities (N,) follow, robustly.
+    Source: the laser radar equation, Höfle and Pfeifer 2007."""
+
+def correct_intensity(
+    intensity: npt.NDArray[np.float32],
+    range: npt.NDArray[np.float32],
+    cosine: npt.NDArray[np.float32] | None,
+    range_exponent: float,
+    incidence_exponent: float,
+) -> npt.NDArray[np.float32]:
+    """Intensities (N,) as they would be at the median range and at normal incidence."""
+
+def stretch_by_rank(values: npt.NDArray[np.float32], top: int) -> npt.NDArray[np.uint16]:
+    """Grey values 0 to ``top`` by rank (N,): every grey is used equally often; NaN becomes 0."""
+
+#: What became of a template, by the code in ``outcome``.
+MATCH_OUTCOMES: list[str]
+
+def resize(image: npt.NDArray[np.float32], width: int, height: int) -> npt.NDArray[np.float32]:
+    """A picture (H, W) at another size, anti-aliased; the borders of the field stay, not the centres of pixels. Source:
+    Mitchell and Netravali, Reconstruction filters in computer graphics, 1988."""
+
+class Features:
+    """What a picture is compared by; ``known`` (H, W) bool says which pixels take part. Immutable."""
+
+    @staticmethod
+    def channels(
+        image: npt.NDArray[np.float32],
+        known: npt.NDArray[np.bool_] | None = None,
+        *,
+        sigma_gradient: float = 0.8,
+        sigma_channel: float = 1.0,
+        saturation: float = 3.0,
+        tuning: str = "cosine4",
+    ) -> Features:
+        """Oriented gradient channels, of reversed contrast the same. ``tuning`` (``cfog``, ``cosine2``, ``cosine4``) is
+        how likeness falls with the angle. Sigmas in px. Raises DegenerateError for a picture without edges. Source: Ye et
+        al., Fast and robust matching for multimodal remote sensing image registration (CFOG), TGRS 2019."""
+
+    @staticmethod
+    def grey(
+        image: npt.NDArray[np.float32], known: npt.NDArray[np.bool_] | None = None, *, sigma: float = 0.8
+    ) -> Features:
+        """Blurred grey values."""
+
+    @staticmethod
+    def mutual_information(
+        image: npt.NDArray[np.float32], known: npt.NDArray[np.bool_] | None = None, *, bins: int = 16
+    ) -> Features:
+        """Grey values in bins of equal population, to be compared by normalised mutual information."""
+
+    @property
+    def width(self) -> int: ...
+    @property
+    def height(self) -> int: ...
+
+def interest_points(
+    image: npt.NDArray[np.float32],
+    known: npt.NDArray[np.bool_] | None = None,
+    *,
+    cell: int = 32,
+    per_cell: int = 2,
+    border: int = 8,
+    sigma_gradient: float = 0.8,
+    sigma_window: float = 4.0,
+    floor: float = 0.5,
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float32]]:
+    """Column and row (N, 2) of the points at which a picture has edges in two directions, and how strong these are: the
+    best ``per_cell`` of each ``cell`` px. Source: Shi and Tomasi 1994, after Harris and Stephens 1988."""
+
+def match_templates(
+    sci: Features,
+    photo: Features,
+    points: npt.NDArray[np.int64],
+    *,
+    half: int = 24,
+    radius: int = 12,
+    least_known: float = 0.5,
+    least_score: float = 0.2,
+    largest_second: float = 0.85,
+    apart: int = 3,
+    hypotheses: int = 1,
+) -> dict[str, npt.NDArray[Any]]:
+    """Searches the template of ``2 half + 1`` px around each of ``points`` (N, 2: column, row) of the SCI in the photo,
+    at shifts up to ``radius`` px. Both pictures have the same size and the same features.
+
+    Columns: ``template`` (M,) int64, the point's row; ``shift`` (M, 2) float64, photo minus SCI, px; ``covariance``
+    (M, 3), xx xy yy, px², by least squares matching; ``score`` and ``second`` (M,) float32, of the best and the next
+    peak; ``outcome`` (M,) uint8, see :data:`MATCH_OUTCOMES`. One row for each template, or, with several
+    ``hypotheses``, one for each peak; then ambiguity is left to the caller. Raises InvalidInputError."""
+
+def relief(inverse_depth: npt.NDArray[np.float32], points: npt.NDArray[np.int64], half: int) -> npt.NDArray[np.float64]:
+    """How far the surface within ``half`` px around each point (N, 2: column, row) departs from a plane: rms (N,),
+    relative to the depth; NaN where too little is known."""
+
+class InformationPhoto:
+    """Grey values of a photo (H, W), prepared for :func:`information_distance`. Immutable."""
+
+    def __init__(self, image: npt.NDArray[np.float32], *, bins: int = 16) -> None: ...
+
+def information_distance(
+    view: View, xyz: FloatArray, intensity: npt.NDArray[np.float32], photo: InformationPhoto
+) -> tuple[float, FloatArray, int]:
+    """The normalised information distance between the ranks 0 to 1 of intensities (N,) of visible points (N, 3) and the
+    photo, whose size is the view's; its gradient (6,) by rotation vector on the left and projection centre; and how
+    many points lie in the photo. Source: Stewart and Newman, LAPS, ICRA 2012. Raises DegenerateError below 100 points."""
+
+def rank(values: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Ranks of values (N,), 0 to 1; equal values share the middle of theirs."""
 
 class VisibilityMap:
     """What one photo sees of the cloud: surfaces between the points, and how deep one sees in each pixel. Immutable.

@@ -8,6 +8,7 @@ mod polynomial;
 mod pose;
 mod project;
 mod roots;
+mod similarity;
 mod view;
 
 pub use block::{Block, BlockProjector, LANES};
@@ -15,4 +16,5 @@ pub use camera::{Camera, Depth, MAX_PARAMS, Model, Projection};
 pub use frustum::Frustum;
 pub use pose::{Pose, rotation_exp, rotation_log, skew_matrix};
 pub use project::{ViewJacobian, project, project_into, unproject};
+pub use similarity::Similarity;
 pub use view::{DltParts, View};

@@ -8,7 +8,9 @@ mod errors;
 mod estimation;
 mod files;
 mod geometry;
+mod matching;
 mod render;
+mod render_sci;
 mod simulate;
 
 use pyo3::prelude::*;
@@ -22,9 +24,11 @@ fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     files::register(m)?;
     geometry::register(m)?;
     render::register(m)?;
+    render_sci::register(m)?;
     colour::register(m)?;
     simulate::register(m)?;
     estimation::register(m)?;
     dlt::register(m)?;
+    matching::register(m)?;
     Ok(())
 }

@@ -67,7 +67,7 @@ impl PyDepthBuffer {
 }
 
 #[pyclass(frozen, name = "IndexBuffer", module = "colourreg_rs._core")]
-pub(super) struct PyIndexBuffer(IndexBuffer);
+pub(super) struct PyIndexBuffer(pub IndexBuffer);
 
 #[pymethods]
 impl PyIndexBuffer {

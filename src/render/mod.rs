@@ -1,7 +1,12 @@
 //! The cloud as the photo's camera sees it: depth buffers that points are put into in any order, and from them the
-//! surfaces that hide what lies behind.
+//! surfaces that hide what lies behind; and the synthetic camera image (SCI), the photo that the scanner would have taken
+//! in its own light.
 
+pub mod filling;
 mod footprint;
+pub mod intensity;
+pub mod resampling;
+pub mod sci;
 mod zbuffer;
 
 pub(crate) use footprint::pixel_angle;

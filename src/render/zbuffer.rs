@@ -310,6 +310,14 @@ impl IndexBuffer {
         self.cells.par_iter().map(|c| f32::from_bits((c.load(Ordering::Relaxed) >> 32) as u32)).collect()
     }
 
+    /// A row of the photo's pixels: inverse depth, 0 where empty, and index.
+    pub(super) fn row(&self, row: usize) -> impl Iterator<Item = (f32, u32)> + '_ {
+        self.grid.photo_row(&self.cells, row).iter().map(|cell| {
+            let bits = cell.load(Ordering::Relaxed);
+            (f32::from_bits((bits >> 32) as u32), !(bits as u32))
+        })
+    }
+
     /// The photo's pixels, row by row: depth (NaN where empty) and index (`None` where empty).
     pub fn pixels(&self) -> impl Iterator<Item = (f32, Option<u32>)> + '_ {
         (0..self.grid.height).flat_map(|row| self.grid.photo_row(&self.cells, row)).map(|cell| {

@@ -1,0 +1,23 @@
+//! SCI against photo: where a piece of the synthetic camera image lies in the real one.
+//!
+//! Near-infrared reflectance and daylight look different: leaves are bright, print is gone, shadows are only in the
+//! photo. What both share is where edges are and how they run, so that images are compared by their oriented gradients
+//! ([`channels`]), with grey values ([`template::Measure::Grey`]) and mutual information as alternatives. What they do
+//! not share comes from relief ([`relief()`]), and matches are trusted accordingly.
+
+pub mod channels;
+mod correlation;
+mod fourier;
+pub mod information;
+pub mod interest;
+mod mutual;
+mod peak;
+pub mod plane;
+mod relief;
+pub mod template;
+
+pub use information::{Information, InformationPhoto, information_distance};
+pub use interest::{Interest, InterestOptions, interest_points};
+pub use plane::Plane;
+pub use relief::relief;
+pub use template::{Features, Match, Measure, Outcome, TemplateOptions, match_templates};

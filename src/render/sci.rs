@@ -1,0 +1,234 @@
+//! The synthetic camera image (Forkuo and King 2004): what each pixel of a view sees of the cloud.
+//!
+//! An [`IndexBuffer`] gives the nearest point in each pixel. Between the points of a near wall the far façade shines
+//! through; [`front`] takes out what the wall's [`Surfaces`] hide. [`gather`] looks the points up: a point lies up to
+//! half a pixel from its pixel's centre, and its true place goes with its pixel. Holes are closed by
+//! [`super::filling`], grey values made by [`super::intensity`] and brought to the pixels' centres by
+//! [`super::resampling`]. Every value is a function of the finished buffer and of the points alone, so that neither
+//! chunks nor threads can be seen in it.
+
+use rayon::prelude::*;
+
+use super::footprint::{Footprint, Surfaces};
+use super::zbuffer::IndexBuffer;
+use crate::error::{Error, Result};
+use crate::geometry::View;
+
+/// Where no point is.
+pub const EMPTY: i64 = -1;
+
+/// The points in front, pixel by pixel.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Front {
+    /// Pixels in a row.
+    pub width: usize,
+    /// Rows.
+    pub height: usize,
+    /// The point's index in its cloud, [`EMPTY`] where there is none.
+    pub index: Vec<i64>,
+    /// Its inverse depth, 0 where there is none.
+    pub inverse_depth: Vec<f32>,
+    /// Whatever has a smaller inverse depth here is hidden; 0 where nothing hides.
+    pub limit: Vec<f32>,
+}
+
+/// The points that no surface hides. Without a footprint every pixel keeps its nearest point.
+pub fn front(buffer: &IndexBuffer, footprint: Option<&Footprint>) -> Front {
+    let grid = buffer.grid();
+    let (width, height) = (grid.width, grid.height);
+    let mut index = vec![EMPTY; width * height];
+    let mut inverse_depth = vec![0.0f32; width * height];
+    let mut limit = vec![0.0f32; width * height];
+    let surfaces =
+        footprint.map(|footprint| Surfaces::from_inverse_depth(buffer.view(), grid, buffer.inverse_depth(), footprint));
+    index
+        .par_chunks_mut(width)
+        .zip(inverse_depth.par_chunks_mut(width))
+        .zip(limit.par_chunks_mut(width))
+        .enumerate()
+        .for_each(|(y, ((index, inverse), limit))| {
+            if let Some(surfaces) = &surfaces {
+                limit.copy_from_slice(grid.photo_row(&surfaces.limit, y));
+            }
+            for (x, (found, point)) in buffer.row(y).enumerate() {
+                if found > 0.0 && found >= limit[x] {
+                    inverse[x] = found;
+                    index[x] = i64::from(point);
+                }
+            }
+        });
+    Front { width, height, index, inverse_depth, limit }
+}
+
+/// A cloud, or a chunk of it.
+pub struct Points<'a> {
+    /// The index of the first in the cloud.
+    pub first: i64,
+    /// World.
+    pub xyz: &'a [[f64; 3]],
+    /// May be empty.
+    pub intensity: &'a [f32],
+    /// Unit or not, of either sense; may be empty.
+    pub normals: &'a [[f64; 3]],
+}
+
+/// What is known of the point behind each pixel; NaN where there is none.
+pub struct Gathered<'a> {
+    /// The point's place from the pixel's centre, x and y.
+    pub offset: &'a mut [[f32; 2]],
+    /// Its intensity.
+    pub intensity: &'a mut [f32],
+    /// Its distance from the scanner.
+    pub range: &'a mut [f32],
+    /// The cosine of the incidence there.
+    pub cosine: &'a mut [f32],
+}
+
+/// Looks up the points of `index` that are among `points`, and leaves the other pixels as they are.
+pub fn gather(view: &View, index: &[i64], station: &[f64; 3], points: &Points, out: Gathered) -> Result<()> {
+    let n = points.xyz.len();
+    let width = view.camera.width as usize;
+    let pixels = width * view.camera.height as usize;
+    for (name, length) in [
+        ("index", index.len()),
+        ("offset", out.offset.len()),
+        ("intensity", out.intensity.len()),
+        ("range", out.range.len()),
+        ("cosine", out.cosine.len()),
+    ] {
+        if length != pixels {
+            return Err(Error::invalid(format!("{name} has {length} pixels, the view {pixels}")));
+        }
+    }
+    let fits = |length: usize| length == 0 || length == n;
+    if !fits(points.intensity.len()) || !fits(points.normals.len()) {
+        return Err(Error::invalid(format!(
+            "{n} points have {} intensities and {} normals",
+            points.intensity.len(),
+            points.normals.len()
+        )));
+    }
+    index
+        .par_chunks(width)
+        .zip(out.offset.par_chunks_mut(width))
+        .zip(out.intensity.par_chunks_mut(width))
+        .zip(out.range.par_chunks_mut(width))
+        .zip(out.cosine.par_chunks_mut(width))
+        .enumerate()
+        .for_each(|(y, ((((index, offset), intensity), range), cosine))| {
+            for (x, &point) in index.iter().enumerate() {
+                let Ok(i) = usize::try_from(point - points.first) else { continue };
+                if point < 0 || i >= n {
+                    continue;
+                }
+                let p = &points.xyz[i];
+                if let Some((xy, _)) = view.project(p) {
+                    // A panorama's point just left of the border may have been rounded into the last column.
+                    offset[x] = [(xy[0] - x as f64) as f32, (xy[1] - y as f64) as f32];
+                }
+                let ray: [f64; 3] = std::array::from_fn(|k| p[k] - station[k]);
+                let norm = |v: &[f64; 3]| (v[0] * v[0] + v[1] * v[1] + v[2] * v[2]).sqrt();
+                range[x] = norm(&ray) as f32;
+                if let Some(value) = points.intensity.get(i) {
+                    intensity[x] = *value;
+                }
+                if let Some(normal) = points.normals.get(i) {
+                    let dot = ray[0] * normal[0] + ray[1] * normal[1] + ray[2] * normal[2];
+                    cosine[x] = (dot.abs() / (norm(&ray) * norm(normal))) as f32;
+                }
+            }
+        });
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::{Matrix3, Vector3};
+
+    use super::*;
+    use crate::geometry::{Camera, Model, Pose};
+
+    fn view() -> View {
+        let camera = Camera::new(Model::OpenCv, 120, 90, &[110.0, 110.0, 59.5, 44.5, -0.1, 0.02, 1e-3, 0.0, 0.0]);
+        View::new(camera.unwrap(), Pose { rotation: Matrix3::identity(), centre: Vector3::new(1.0, 2.0, 3.0) })
+    }
+
+    fn noise(i: usize) -> f64 {
+        ((i as f64 * 12.9898).sin() * 43758.5453).fract().abs()
+    }
+
+    /// A wall at 10 m with a board of 2 m × 2 m at 5 m before it.
+    fn cloud() -> Vec<[f64; 3]> {
+        (0..60_000)
+            .map(|i| {
+                let (u, v) = (noise(i) * 2.0 - 1.0, noise(i + 100_000) * 2.0 - 1.0);
+                if i % 6 == 0 { [1.0 + u, 2.0 + v, 8.0] } else { [1.0 + 6.0 * u, 2.0 + 5.0 * v, 13.0] }
+            })
+            .collect()
+    }
+
+    fn rendered(xyz: &[[f64; 3]], chunks: usize, footprint: Option<&Footprint>) -> (Front, Vec<[f32; 2]>, Vec<f32>) {
+        let view = view();
+        let buffer = IndexBuffer::new(view).unwrap();
+        let size = xyz.len().div_ceil(chunks);
+        for (k, chunk) in xyz.chunks(size).enumerate() {
+            buffer.add(chunk, (k * size) as u64).unwrap();
+        }
+        let front = front(&buffer, footprint);
+        let n = front.index.len();
+        let (mut offset, mut range) = (vec![[f32::NAN; 2]; n], vec![f32::NAN; n]);
+        let (mut intensity, mut cosine) = (vec![f32::NAN; n], vec![f32::NAN; n]);
+        for (k, chunk) in xyz.chunks(size).enumerate() {
+            let points = Points { first: (k * size) as i64, xyz: chunk, intensity: &[], normals: &[] };
+            let out =
+                Gathered { offset: &mut offset, intensity: &mut intensity, range: &mut range, cosine: &mut cosine };
+            gather(&view, &front.index, &[1.0, 2.0, 3.0], &points, out).unwrap();
+        }
+        (front, offset, range)
+    }
+
+    #[test]
+    fn index_offset_and_depth_are_those_of_the_point() {
+        let (xyz, view) = (cloud(), view());
+        let (front, offset, range) = rendered(&xyz, 1, Some(&Footprint::default()));
+        let mut seen = 0;
+        for (i, &point) in front.index.iter().enumerate().filter(|(_, p)| **p >= 0) {
+            let (xy, depth) = view.project(&xyz[point as usize]).unwrap();
+            let (x, y) = ((i % 120) as f64, (i / 120) as f64);
+            assert!((xy[0] - x - f64::from(offset[i][0])).abs() < 1e-5 && (xy[0] - x).abs() <= 0.5);
+            assert!((xy[1] - y - f64::from(offset[i][1])).abs() < 1e-5 && (xy[1] - y).abs() <= 0.5);
+            assert!((f64::from(front.inverse_depth[i]) * depth - 1.0).abs() < 1e-6);
+            assert!(f64::from(range[i]) >= depth * 0.999);
+            seen += 1;
+        }
+        assert!(seen > 8000, "{seen}");
+    }
+
+    #[test]
+    fn the_wall_does_not_shine_through_the_board() {
+        // 10,000 points on about 44 × 44 pixels, thinned until one pixel in five is empty.
+        let xyz: Vec<[f64; 3]> = cloud().into_iter().enumerate().filter(|(i, _)| i % 4 != 0).map(|(_, p)| p).collect();
+        let through = |footprint| {
+            let (front, _, _) = rendered(&xyz, 1, footprint);
+            let inside = (32..58).flat_map(|y| (47..73).map(move |x| y * 120 + x));
+            inside.filter(|i| front.index[*i] >= 0 && front.inverse_depth[*i] < 0.15).count()
+        };
+        assert!(through(None) > 20, "{}", through(None));
+        assert_eq!(through(Some(&Footprint::default())), 0);
+    }
+
+    #[test]
+    fn neither_chunks_nor_threads_are_seen_in_the_result() {
+        let xyz = cloud();
+        let run = |threads: usize, chunks: usize| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| rendered(&xyz, chunks, Some(&Footprint::default())))
+        };
+        let bits = |(front, offset, range): (Front, Vec<[f32; 2]>, Vec<f32>)| {
+            let offset: Vec<_> = offset.iter().map(|o| o.map(f32::to_bits)).collect();
+            (front, offset, range.iter().map(|r| r.to_bits()).collect::<Vec<_>>())
+        };
+        let one = bits(run(1, 1));
+        assert!(one == bits(run(3, 1)) && one == bits(run(2, 7)));
+    }
+}

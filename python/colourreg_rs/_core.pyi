@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
 
 __version__: str
 debug_build: bool
@@ -418,3 +419,191 @@ class SimulatedScene:
     def radiance_at(self, view: View, xy: FloatArray, sigma: float, own_surface: bool) -> npt.NDArray[np.float32]:
         """Linear radiance (N, 3) at pixels (N, 2) through square pixels and a Gaussian lens blur of ``sigma`` pixels;
         with ``own_surface`` of the primitive in the middle alone. NaN where the lens shows nothing."""
+
+class Warning:
+    """A doubt about an estimated view."""
+
+    @property
+    def code(self) -> str:
+        """``no_redundancy``, ``few_points``, ``variance_factor``, ``large_residuals``, ``small_extent``,
+        ``border_error``, ``correlation``, ``not_visible``, ``chance``, ``ambiguous``, ``few_inliers``; of a DLT also
+        ``weak``, ``skew`` and ``aspect``."""
+
+    @property
+    def fatal(self) -> bool:
+        """Whether the view must not be used without a person's look."""
+
+    @property
+    def message(self) -> str:
+        """In words, with the figure, and what to do."""
+
+    @property
+    def value(self) -> float: ...
+    @property
+    def limit(self) -> float: ...
+
+class Verdict:
+    """Whether a view may be trusted."""
+
+    @property
+    def ok(self) -> bool:
+        """Whether no doubt is fatal."""
+
+    @property
+    def warnings(self) -> list[Warning]: ...
+
+class ResectionResult:
+    """An estimated view, its precision, and what became of each point."""
+
+    @property
+    def view(self) -> View: ...
+    @property
+    def parameters(self) -> list[str]:
+        """Names of the U free parameters, in the order of the covariances: ``rx ry rz`` (a small rotation vector
+        applied on the left, radians), ``cx_world cy_world cz_world`` (projection centre), then camera parameters."""
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(U, U), a posteriori: scaled by the variance factor; with a robust loss the sandwich estimate."""
+
+    @property
+    def covariance_apriori(self) -> FloatArray:
+        """(U, U) with the sigmas as they were given (1 px where they were not)."""
+
+    @property
+    def sigma0(self) -> float:
+        """The square root of the variance factor, in units of the given sigma; NaN without redundancy."""
+
+    @property
+    def dof(self) -> float:
+        """Coordinates in use and priors, less free parameters."""
+
+    @property
+    def residuals(self) -> FloatArray:
+        """(N, 2) projected minus measured, pixels, of every point; NaN where it is not visible."""
+
+    @property
+    def status(self) -> list[str]:
+        """Of every point: ``used``, ``rejected``, ``check`` or ``not visible``."""
+
+    @property
+    def rms(self) -> float:
+        """Per coordinate, of the points in use, pixels."""
+
+    @property
+    def rms_x(self) -> float: ...
+    @property
+    def rms_y(self) -> float: ...
+    @property
+    def rmse(self) -> float:
+        """Radial: the square root of the mean squared length."""
+
+    @property
+    def check_rms(self) -> float:
+        """As ``rms``, of the check points; NaN where there are none."""
+
+    @property
+    def check_rms_x(self) -> float: ...
+    @property
+    def check_rms_y(self) -> float: ...
+    @property
+    def check_rmse(self) -> float: ...
+    @property
+    def iterations(self) -> int: ...
+    @property
+    def stop(self) -> str:
+        """Why the iteration stopped."""
+
+    @property
+    def test_ratios(self) -> FloatArray | None:
+        """(N,) of a robust estimate: each point's test statistic over its critical value, above 1 for blunders; NaN for
+        check points."""
+
+    @property
+    def threshold(self) -> float | None:
+        """Of a robust estimate: the radius of the consensus that the selection started from, pixels."""
+
+    @property
+    def samples(self) -> int | None:
+        """Of a robust estimate: how many samples were drawn."""
+
+    @property
+    def log10_false_alarms(self) -> float:
+        """log10 of the number of views as well supported as this one that points thrown at random over the photo would
+        give. Source: Moisan and Stival 2004."""
+
+    @property
+    def border_error(self) -> float:
+        """The largest predicted error at the photo's border, px per coordinate, for a point at the control points'
+        median distance."""
+
+    @property
+    def centre_error(self) -> float:
+        """The same in the photo's middle."""
+
+    @property
+    def second_view(self) -> View | None:
+        """Another view that explains the points nearly as well; the verdict calls it ``ambiguous``."""
+
+    @property
+    def verdict(self) -> Verdict: ...
+
+def resect(
+    view: View,
+    xyz: FloatArray,
+    xy: FloatArray,
+    *,
+    free: list[str] = ...,
+    sigma_xy: float | FloatArray | None = None,
+    priors: list[tuple[str, float, float]] = ...,
+    loss: str = "squares",
+    start: str = "auto",
+    check: BoolArray | None = None,
+) -> ResectionResult:
+    """Space resection: the view that sees the world points ``xyz`` (N, 3) at the pixels ``xy`` (N, 2).
+
+    ``free`` names what is estimated: ``pose`` (the default), ``f`` (fx and fy in their ratio), ``aspect``, ``pp``,
+    ``distortion`` (k1 k2 p1 p2, of a fisheye k1 to k4), and single parameters; the rest keeps the value of ``view``.
+    ``sigma_xy``: one sigma, (N, 2) sigmas or (N, 2, 2) covariances, pixels. ``priors``: (name, value, sigma) of
+    parameters known before; sigma 0 holds the parameter; ``rx ry rz`` count from the rotation of ``view``. ``loss``:
+    ``squares``, ``huber``, ``cauchy`` or ``tukey``, tuned for 95 % efficiency, in units of the given sigmas, or else of
+    the residuals' own median. ``start``: ``search`` finds a start by P3P on spread points, whatever the pose of
+    ``view``; ``given`` starts there; ``auto`` searches where the whole pose is free and the points suffice. ``check``:
+    (N,), true for points that only get their residuals.
+
+    Raises InvalidInputError (too few points, contradicting free parameters), DegenerateError (parameters that the
+    points do not determine, by name) and NotConvergedError. Source: Levenberg and Marquardt on the collinearity
+    equations.
+    """
+
+def resect_robust(
+    view: View,
+    xyz: FloatArray,
+    xy: FloatArray,
+    *,
+    free: list[str] = ...,
+    sigma_xy: float | FloatArray | None = None,
+    threshold: float | None = None,
+    priors: list[tuple[str, float, float]] = ...,
+    loss: str = "squares",
+    check: BoolArray | None = None,
+    significance: float = 0.001,
+    confidence: float = 0.9999,
+    max_iterations: int = 100_000,
+    seed: int = 0,
+    unknown_focal: bool = False,
+) -> ResectionResult:
+    """As :func:`resect`, among blunders, which come back ``rejected``.
+
+    What a blunder is, is decided by ``threshold`` (a fixed radius in pixels), or by a test of each point against the
+    fit to the others, with the given ``sigma_xy`` or, without one, with the noise of those that agree; ``significance``
+    holds for all points together. The start is found by RANSAC over P3P (over four points and a grid of focal lengths
+    where ``unknown_focal``), locally optimised, with MSAC scores under a known noise and a-contrario scores otherwise.
+    The same ``seed`` gives the same result at any number of threads. The final estimate is that of the points in use,
+    exactly.
+    Sources: Chum et al. 2003; Moisan and Stival 2004; Baarda 1968.
+    """
+
+def p3p(view: View, xyz: FloatArray, xy: FloatArray) -> list[View]:
+    """All views (at most four) with the camera of ``view`` that see three world points (3, 3) at three pixels (3, 2).
+    Raises DegenerateError for points on one line. Source: Persson and Nordberg 2018."""

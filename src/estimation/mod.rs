@@ -1,5 +1,30 @@
 //! From control points to views: what is estimated, and how.
 
+mod batch;
+mod blunders;
+mod collinearity;
+mod fit;
+mod levenberg;
+mod loss;
+mod observations;
+mod p3p;
 mod parameters;
+mod ransac;
+mod resection;
+mod residuals;
+mod sampling;
+mod score;
+mod start;
+mod verdict;
 
+pub use blunders::Criterion;
+pub use levenberg::Stop;
+pub use loss::Loss;
+pub use observations::{Observations, Precision};
+pub use p3p::{UpToFour, p3p, views_of_three};
 pub use parameters::{FreeSet, MAX_FREE, POSE_NAMES, Parameter};
+pub use ransac::RansacOptions;
+pub use resection::{Prior, Resection, ResectionOptions, Start, Status, resect, resect_robust};
+pub use residuals::Rms;
+pub use sampling::Random;
+pub use verdict::{Verdict, Warning};

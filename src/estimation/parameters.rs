@@ -126,6 +126,19 @@ impl FreeSet {
         self.parameters.iter().position(|p| name_of(self.model, *p) == name)
     }
 
+    /// Which of `rx ry rz` (0..3) the parameter at a place is.
+    pub fn rotation_axis(&self, place: usize) -> Option<usize> {
+        match self.parameters.get(place) {
+            Some(Parameter::Pose(i)) if *i < 3 => Some(*i),
+            _ => None,
+        }
+    }
+
+    /// The place of `rx ry rz` (0..3) in the set.
+    pub fn rotation_place(&self, axis: usize) -> Option<usize> {
+        self.parameters.iter().position(|p| *p == Parameter::Pose(axis))
+    }
+
     /// The set without the parameters at these places.
     pub fn without(&self, places: &[usize]) -> Self {
         let kept = self.parameters.iter().enumerate().filter(|(i, _)| !places.contains(i));
@@ -199,17 +212,22 @@ impl FreeSet {
     /// first [`FreeSet::len`] places of `rows`.
     #[inline]
     pub fn columns(&self, view: &View, j: &ViewJacobian, rows: &mut [[f64; MAX_FREE]; 2]) {
-        let mut camera = None;
-        for (k, p) in self.parameters.iter().enumerate() {
+        // The set is ordered and without repetition: a sixth that is the pose's sixth means that all six are there.
+        let whole_pose = self.parameters.get(5) == Some(&Parameter::Pose(5));
+        let first = if whole_pose {
+            rows[0][..6].copy_from_slice(&j.d_pose[0]);
+            rows[1][..6].copy_from_slice(&j.d_pose[1]);
+            6
+        } else {
+            0
+        };
+        for (k, p) in self.parameters.iter().enumerate().skip(first) {
             for (i, row) in rows.iter_mut().enumerate() {
                 row[k] = match *p {
                     Parameter::Pose(m) => j.d_pose[i][m],
                     Parameter::Camera(m) => j.d_params[i][m],
                     other => {
-                        let [fx, fy, cy] = *camera.get_or_insert_with(|| {
-                            let all = view.camera.params();
-                            [all[0], all[1], all[3]]
-                        });
+                        let [fx, fy, _, cy] = view.camera.affine();
                         match other {
                             Parameter::Focal => j.d_params[i][0] + fy / fx * j.d_params[i][1],
                             Parameter::Aspect => fx * j.d_params[i][1],

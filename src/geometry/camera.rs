@@ -156,6 +156,20 @@ impl Camera {
         self.skew
     }
 
+    /// fx fy cx cy; zero for a panorama.
+    pub fn affine(&self) -> [f64; 4] {
+        [self.fx, self.fy, self.cx, self.cy]
+    }
+
+    /// The distortion terms k1 k2 p1 p2 k3 k4 k5 k6 and the squared radius up to which they are valid; `None` for
+    /// fisheye and panorama.
+    pub fn polynomial(&self) -> Option<([f64; 8], f64)> {
+        match &self.lens {
+            Lens::Polynomial(lens) => Some((lens.k, lens.max_r2)),
+            Lens::Fisheye(_) | Lens::Equirectangular => None,
+        }
+    }
+
     /// The parameters in the model's order.
     pub fn params(&self) -> Vec<f64> {
         let mut all = vec![self.fx, self.fy, self.cx, self.cy];
@@ -258,6 +272,24 @@ impl Camera {
             Lens::Fisheye(lens) => Some(self.fisheye_jacobian(lens, p, xy)),
             Lens::Equirectangular => self.panorama_jacobian(p, xy),
         }
+    }
+
+    /// As [`Camera::project_with_jacobian`] with d(x, y)/d(point) alone, which costs little more than projecting.
+    #[inline]
+    pub fn project_with_point_jacobian(&self, p: &Vector3<f64>) -> Option<([f64; 2], [[f64; 3]; 2])> {
+        let Lens::Polynomial(lens) = &self.lens else {
+            return self.project_with_jacobian(p).map(|j| (j.xy, j.d_point));
+        };
+        if p.z <= 0.0 || p.z.is_nan() {
+            return None;
+        }
+        let iz = 1.0 / p.z;
+        let (x, y) = (p.x * iz, p.y * iz);
+        let ([xd, yd], [xx, xy, yy]) = lens.distort_with_slope(x, y)?;
+        let row = |a: f64, b: f64| [a * iz, b * iz, -(a * x + b * y) * iz];
+        let d_point =
+            [row(self.fx * xx + self.skew * xy, self.fx * xy + self.skew * yy), row(self.fy * xy, self.fy * yy)];
+        Some((self.pixel_at(xd, yd), d_point))
     }
 
     /// Rows of d(x, y)/d(a) from rows of d(xd, yd)/d(a).

@@ -69,6 +69,21 @@ pub struct ViewJacobian {
 }
 
 impl View {
+    /// Pixel position of one world point and d(x, y)/d(rotation vector on the left, projection centre); `None` where the
+    /// camera cannot see it.
+    #[inline]
+    pub fn project_with_pose_jacobian(&self, p_world: &[f64; 3]) -> Option<([f64; 2], [[f64; 6]; 2])> {
+        let p = self.pose.transform(p_world);
+        let (xy, j) = self.camera.project_with_point_jacobian(&p)?;
+        let r = &self.pose.rotation;
+        let row = |a: &[f64; 3]| {
+            let by = |k: usize| -(a[0] * r[(0, k)] + a[1] * r[(1, k)] + a[2] * r[(2, k)]);
+            // a · (δ × p) = δ · (p × a)
+            [p.y * a[2] - p.z * a[1], p.z * a[0] - p.x * a[2], p.x * a[1] - p.y * a[0], by(0), by(1), by(2)]
+        };
+        Some((xy, [row(&j[0]), row(&j[1])]))
+    }
+
     /// Pixel position and all derivatives of one world point; `None` where the camera cannot see it.
     pub fn project_with_jacobian(&self, p_world: &[f64; 3]) -> Option<ViewJacobian> {
         let p = self.pose.transform(p_world);

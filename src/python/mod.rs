@@ -4,6 +4,7 @@ mod arrays;
 mod codecs;
 mod colour;
 mod errors;
+mod estimation;
 mod files;
 mod geometry;
 mod matching;
@@ -26,5 +27,6 @@ fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     colour::register(m)?;
     simulate::register(m)?;
     matching::register(m)?;
+    estimation::register(m)?;
     Ok(())
 }

@@ -186,7 +186,7 @@ fn pose_normal(sums: &PoseSums, weight: f64) -> Normal {
     for i in 0..6 {
         normal.g[i] = sums.g[i] * weight;
         for (j, n) in (i..6).zip(&mut upper) {
-            normal.n[i][j] = n * weight;
+            normal.n[6 * i + j] = n * weight;
         }
     }
     normal
@@ -197,7 +197,9 @@ impl LeastSquares for Collinearity<'_> {
 
     fn normal(&self, view: &View) -> Option<Normal> {
         let sums = self.sums(view)?;
-        let finite = sums.cost.is_finite() && sums.n.iter().flatten().chain(&sums.g).all(|v| v.is_finite());
+        let u = sums.len;
+        let finite =
+            sums.cost.is_finite() && sums.g[..u].iter().all(|v| v.is_finite()) && sums.n.iter().all(|v| v.is_finite());
         finite.then_some(sums)
     }
 

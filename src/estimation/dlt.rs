@@ -294,6 +294,7 @@ fn result(
         xyz: &used.xyz,
         typical_sigma: used.precision.typical_sigma(),
         sigma_known: options.precision.is_some(),
+        selected: false,
     };
     let predicted = predicted_errors(&evidence);
     let mut verdict = Verdict::default();

@@ -1,6 +1,7 @@
 //! A view fitted to points from a starting view, and the precision of what was fitted.
 
 use nalgebra::DMatrix;
+use rayon::prelude::*;
 
 use super::collinearity::{Collinearity, Priors};
 use super::levenberg::{Limits, Outcome, minimise};
@@ -96,5 +97,5 @@ fn undetermined(names: &[&str], value: f64) -> Error {
 pub(super) fn residuals(observations: &Observations, view: &View) -> Vec<[f64; 2]> {
     let one =
         |p: &[f64; 3], q: &[f64; 2]| view.project(p).map_or([f64::NAN; 2], |(xy, _)| [xy[0] - q[0], xy[1] - q[1]]);
-    observations.xyz.iter().zip(&observations.xy).map(|(p, q)| one(p, q)).collect()
+    observations.xyz.par_iter().zip(&observations.xy).with_min_len(4096).map(|(p, q)| one(p, q)).collect()
 }

@@ -10,13 +10,13 @@ use super::parameters::MAX_FREE;
 /// A vector of parameters, of which the first few count.
 pub type Small = [f64; MAX_FREE];
 
-/// The normal equations at a state, in place: an iteration allocates nothing.
+/// The normal equations at a state.
 #[derive(Debug, Clone)]
 pub struct Normal {
     /// How many parameters there are.
     pub len: usize,
-    /// JᵀJ, weighted; the upper triangle counts.
-    pub n: [Small; MAX_FREE],
+    /// JᵀJ, weighted, row by row; the upper triangle counts.
+    pub n: Vec<f64>,
     /// Jᵀv, weighted.
     pub g: Small,
     /// vᵀv, weighted, or the sum of a robust loss.
@@ -26,34 +26,29 @@ pub struct Normal {
 impl Normal {
     /// Nothing summed yet.
     pub fn zero(len: usize) -> Self {
-        Self { len, n: [[0.0; MAX_FREE]; MAX_FREE], g: [0.0; MAX_FREE], cost: 0.0 }
+        Self { len, n: vec![0.0; len * len], g: [0.0; MAX_FREE], cost: 0.0 }
     }
 
     /// An element of the symmetric JᵀJ.
     pub fn at(&self, i: usize, j: usize) -> f64 {
-        self.n[i.min(j)][i.max(j)]
+        self.n[i.min(j) * self.len + i.max(j)]
     }
 
     /// Adds a weighted design row and its misclosure.
     #[inline(always)]
     pub fn add(&mut self, row: &[f64], v: f64) {
-        for i in 0..row.len() {
-            let r = row[i];
+        for ((i, r), sums) in row.iter().enumerate().zip(self.n.chunks_exact_mut(self.len)) {
             self.g[i] += r * v;
-            for j in i..row.len() {
-                self.n[i][j] += r * row[j];
+            for (sum, other) in sums[i..].iter_mut().zip(&row[i..]) {
+                *sum += r * other;
             }
         }
     }
 
     /// Adds the sums of another part of the observations.
     pub fn absorb(&mut self, other: &Self) {
-        for i in 0..self.len {
-            self.g[i] += other.g[i];
-            for j in i..self.len {
-                self.n[i][j] += other.n[i][j];
-            }
-        }
+        self.n.iter_mut().zip(&other.n).for_each(|(a, b)| *a += b);
+        self.g.iter_mut().zip(&other.g).for_each(|(a, b)| *a += b);
         self.cost += other.cost;
     }
 }
@@ -166,15 +161,14 @@ pub fn minimise<P: LeastSquares>(problem: &P, start: P::State, limits: &Limits) 
             lambda = 1e-15;
             continue;
         }
-        // Below half the digits of the cost the cost itself cannot judge a step; Newton's steps still improve.
-        let unjudgeable = q2 <= 1e-14 * at.normal.cost + floor;
+        // Rounding of the residuals hides what such a step gains; Newton's steps improve the state all the same.
+        let hidden = 1e-14 * at.normal.cost + (floor * at.normal.cost).sqrt() + floor;
+        let unjudgeable = q2 <= hidden;
         let len = at.normal.len;
         let predicted = -(0..len).map(|i| delta[i] * at.normal.g[i]).sum::<f64>() - 0.5 * q2;
         let next = problem.step(&at.state, &delta[..len]).and_then(|s| problem.normal(&s).map(|n| (s, n)));
         let accepted = match &next {
-            Some((_, n)) => {
-                n.cost < at.normal.cost || (unjudgeable && n.cost <= at.normal.cost * (1.0 + 1e-10) + floor)
-            }
+            Some((_, n)) => n.cost < at.normal.cost || (unjudgeable && n.cost <= at.normal.cost + hidden),
             None => false,
         };
         if let (true, Some((state, normal))) = (accepted, next) {
@@ -186,7 +180,13 @@ pub fn minimise<P: LeastSquares>(problem: &P, start: P::State, limits: &Limits) 
                 at.stop = if tiny { Stop::SmallStep } else { Stop::Stalled };
                 return Some(at);
             }
-            lambda *= if gain > 0.75 || unjudgeable { 0.01 } else { (1.0 - (2.0 * gain - 1.0).powi(3)).max(1.0 / 3.0) };
+            lambda *= if gain > 0.75 && lambda > 1e-4 {
+                0.2
+            } else if gain > 0.75 || unjudgeable {
+                0.01
+            } else {
+                (1.0 - (2.0 * gain - 1.0).powi(3)).max(1.0 / 3.0)
+            };
             lambda = lambda.max(1e-15);
             growth = 2.0;
         } else {
@@ -210,7 +210,7 @@ fn damped_step(normal: &Normal, lambda: f64) -> Option<Small> {
     let u = normal.len;
     let mut scale = [0.0; MAX_FREE];
     for i in 0..u {
-        scale[i] = 1.0 / normal.n[i][i].sqrt();
+        scale[i] = 1.0 / normal.at(i, i).sqrt();
         if !scale[i].is_finite() {
             return None;
         }
@@ -222,12 +222,12 @@ fn damped_step(normal: &Normal, lambda: f64) -> Option<Small> {
             let known: f64 = (0..j).map(|k| l[i][k] * l[j][k]).sum();
             if i == j {
                 let pivot = 1.0 + lambda - known;
-                if !(pivot > 1e-15) {
+                if pivot <= 1e-15 || pivot.is_nan() {
                     return None;
                 }
                 l[i][i] = pivot.sqrt();
             } else {
-                l[i][j] = (normal.n[j][i] * scale[i] * scale[j] - known) / l[j][j];
+                l[i][j] = (normal.at(j, i) * scale[i] * scale[j] - known) / l[j][j];
             }
         }
         let known: f64 = (0..i).map(|k| l[i][k] * y[k]).sum();
@@ -247,9 +247,9 @@ fn damped_step(normal: &Normal, lambda: f64) -> Option<Small> {
 fn quadratic(normal: &Normal, d: &Small) -> f64 {
     let mut sum = 0.0;
     for i in 0..normal.len {
-        sum += normal.n[i][i] * d[i] * d[i];
+        sum += normal.at(i, i) * d[i] * d[i];
         for j in i + 1..normal.len {
-            sum += 2.0 * normal.n[i][j] * d[i] * d[j];
+            sum += 2.0 * normal.at(i, j) * d[i] * d[j];
         }
     }
     sum

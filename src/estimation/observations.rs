@@ -1,5 +1,6 @@
 //! What was measured: pixels of known points, and how precise each is.
 
+use std::borrow::Cow;
 use std::sync::OnceLock;
 
 use nalgebra::Vector3;
@@ -30,6 +31,12 @@ impl Precision {
         for (i, s) in sigmas.iter().enumerate() {
             check_sigma(s[0], &format!("sigma_xy of point {i} in x"))?;
             check_sigma(s[1], &format!("sigma_xy of point {i} in y"))?;
+        }
+        // Sigmas that are all the same are one sigma.
+        if let Some(first) = sigmas.first()
+            && sigmas.iter().flatten().all(|s| *s == first[0])
+        {
+            return Ok(Self::Same(first[0]));
         }
         Ok(Self::Each(sigmas.iter().map(|s| [1.0 / s[0], 0.0, 1.0 / s[1]]).collect()))
     }
@@ -164,6 +171,11 @@ impl Observations {
             precision: self.precision.select(indices),
             packed: OnceLock::new(),
         }
+    }
+
+    /// As [`Observations::select`], without a copy where it is all of them.
+    pub(super) fn part(&self, indices: &[usize]) -> Cow<'_, Self> {
+        if indices.len() == self.len() { Cow::Borrowed(self) } else { Cow::Owned(self.select(indices)) }
     }
 
     /// The points in batches.

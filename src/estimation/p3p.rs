@@ -261,7 +261,7 @@ fn sized(ray: &Vector3<f64>, a: &[f64; 3], b: &[f64; 3]) -> Option<Vector3<f64>>
         let Some(inverse) = j.try_inverse() else { break };
         let next = l - inverse * error;
         let e = miss(&next);
-        if !(e.amax() < size) {
+        if e.amax() >= size || e.amax().is_nan() {
             break;
         }
         (l, error) = (next, e);
@@ -345,10 +345,10 @@ mod tests {
         let mut missed = 0;
         for _ in 0..10_000 {
             let x = [0, 1, 2].map(|_| {
-                let t = 6.28 * random.uniform();
+                let t = std::f64::consts::TAU * random.uniform();
                 [t.cos(), t.sin(), 0.0]
             });
-            let t = 6.28 * random.uniform();
+            let t = std::f64::consts::TAU * random.uniform();
             let centre = Vector3::new(t.cos(), t.sin(), 0.5 + 3.0 * random.uniform());
             let rotation = rotation_exp(&Vector3::new(random.normal(), random.normal(), random.normal()));
             let truth = Pose { rotation, centre };

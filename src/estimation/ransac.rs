@@ -23,6 +23,11 @@ use crate::geometry::{Camera, Model, Pose, View};
 const SEARCHED: usize = 4096;
 /// Points that a local optimisation uses at most.
 const OPTIMISED: usize = 256;
+/// Searches within the supporters, and the samples of each.
+const FINER: usize = 3;
+const FINER_ITERATIONS: usize = 500;
+/// log10 of the false alarms below which a closer agreement is no chance.
+const NO_CHANCE: f64 = -1.0;
 /// Iterations before the first thought of stopping.
 const FIRST_ITERATIONS: usize = 48;
 
@@ -92,41 +97,45 @@ pub(super) fn search(o: &Observations, camera: &Camera, options: &RansacOptions)
     order.truncate(SEARCHED);
     let searched = o.select(&order);
     let area = f64::from(camera.width) * f64::from(camera.height);
-    let cameras = if options.unknown_focal { unknown_focal_cameras(camera) } else { vec![*camera] };
-    let mut run = Search {
-        seen: vec![vec![Seen::Unasked; searched.len()]; cameras.len()],
-        cameras,
-        scorer: Scorer::new(&searched, options.threshold, sample, area),
-        o: &searched,
-        free: if options.unknown_focal {
-            FreeSet::parse(camera.model(), &["pose", "f"])?
-        } else {
-            FreeSet::pose(camera.model())
-        },
-        best: None,
+    let (cameras, free) = if options.unknown_focal {
+        (unknown_focal_cameras(camera), FreeSet::parse(camera.model(), &["pose", "f"])?)
+    } else {
+        (vec![*camera], FreeSet::pose(camera.model()))
     };
-    let mut needed = options.max_iterations;
-    let mut iterations = 0;
-    while iterations < needed.max(FIRST_ITERATIONS).min(options.max_iterations) {
-        let mut random = Random::of_task(options.seed, iterations as u64);
-        iterations += 1;
-        let improved = if options.unknown_focal {
-            run.try_four(random.distinct::<4>(searched.len()))
-        } else {
-            run.try_three(random.distinct::<3>(searched.len()))
-        };
-        if improved && let Some((score, _)) = &run.best {
-            needed = iterations_needed(score.inliers, searched.len(), sample, options.confidence);
-        }
-    }
-    match run.best {
-        Some((score, view)) => Ok(Consensus { view, threshold: score.threshold2.sqrt(), iterations }),
-        None => Err(Error::NotConverged {
+    let mut run = Search::new(&searched, cameras, free, Scorer::new(&searched, options.threshold, sample, area));
+    let iterations = run.run(options);
+    let Some((mut score, mut view)) = run.best else {
+        return Err(Error::NotConverged {
             what: "the search for a view among blunders",
             iterations,
             detail: "no sample of points gave a view that others agree with; check the pairing of the points".into(),
-        }),
+        });
+    };
+    if options.threshold.is_none() {
+        // Against the whole photo, a blunder of a few sigmas looks like support. Against the disc of the supporters
+        // themselves it does not: search in it for something closer, as long as there is.
+        for _ in 0..FINER {
+            let Some(finer) = closer(&searched, &score, &view, options) else { break };
+            (score, view) = finer;
+        }
     }
+    Ok(Consensus { view, threshold: score.threshold2.sqrt(), iterations })
+}
+
+/// A view that part of the supporters agree on far more closely than chance would have it among them.
+fn closer(o: &Observations, found: &Score, view: &View, options: &RansacOptions) -> Option<(Score, View)> {
+    let radius2 = found.threshold2;
+    let sigma = o.precision.typical_sigma();
+    let squares = o.squares(view);
+    let inside: Vec<usize> = (0..o.len()).filter(|&i| squares[i] * sigma * sigma <= radius2).collect();
+    if inside.len() < 5 {
+        return None;
+    }
+    let supporters = o.select(&inside);
+    let scorer = Scorer::new(&supporters, None, 3, std::f64::consts::PI * radius2);
+    let mut run = Search::new(&supporters, vec![view.camera], FreeSet::pose(view.camera.model()), scorer);
+    run.run(&RansacOptions { max_iterations: options.max_iterations.min(FINER_ITERATIONS), ..*options });
+    run.best.filter(|(score, _)| score.value < NO_CHANCE && score.threshold2 <= 0.25 * radius2)
 }
 
 fn unknown_focal_cameras(camera: &Camera) -> Vec<Camera> {
@@ -163,7 +172,31 @@ struct Search<'a> {
     best: Option<(Score, View)>,
 }
 
-impl Search<'_> {
+impl<'a> Search<'a> {
+    fn new(o: &'a Observations, cameras: Vec<Camera>, free: FreeSet, scorer: Scorer<'a>) -> Self {
+        Self { o, seen: vec![vec![Seen::Unasked; o.len()]; cameras.len()], cameras, scorer, free, best: None }
+    }
+
+    /// Draws samples until a better one is unlikely; how many.
+    fn run(&mut self, options: &RansacOptions) -> usize {
+        let n = self.o.len();
+        let mut needed = options.max_iterations;
+        let mut iterations = 0;
+        while iterations < needed.max(FIRST_ITERATIONS).min(options.max_iterations) {
+            let mut random = Random::of_task(options.seed, iterations as u64);
+            iterations += 1;
+            let improved = if self.sample() == 4 {
+                self.try_four(random.distinct::<4>(n))
+            } else {
+                self.try_three(random.distinct::<3>(n))
+            };
+            if improved && let Some((score, _)) = &self.best {
+                needed = iterations_needed(score.inliers, n, self.sample(), options.confidence);
+            }
+        }
+        iterations
+    }
+
     fn towards(&mut self, camera: usize, point: usize) -> Option<Vector3<f64>> {
         let seen = &mut self.seen[camera][point];
         if let Seen::Unasked = seen {
@@ -214,7 +247,7 @@ impl Search<'_> {
     /// Takes a hypothesis that beats the best, after refining it.
     fn offer(&mut self, view: &View) -> bool {
         let Some(score) = self.scorer.score(view, self.best.as_ref().map(|b| &b.0)) else { return false };
-        if self.best.as_ref().is_some_and(|b| score.value >= b.0.value) || score.inliers <= self.scorer_sample() {
+        if self.best.as_ref().is_some_and(|b| score.value >= b.0.value) || score.inliers <= self.sample() {
             return false;
         }
         self.best = Some((score, *view));
@@ -222,7 +255,7 @@ impl Search<'_> {
         true
     }
 
-    fn scorer_sample(&self) -> usize {
+    fn sample(&self) -> usize {
         if self.free.is_pose() { 3 } else { 4 }
     }
 
@@ -232,7 +265,7 @@ impl Search<'_> {
         for round in 0..4 {
             let widened = score.threshold2 * [4.0, 2.0, 1.0, 1.0][round];
             let mut inliers = self.scorer.within(&view, widened, OPTIMISED);
-            if inliers.len() < self.scorer_sample() + 1 {
+            if inliers.len() < self.sample() + 1 {
                 inliers = self.scorer.within(&view, score.threshold2, OPTIMISED);
             }
             let Some(fitted) = fit_plainly(&self.o.select(&inliers), &self.free, &view, &limits) else { return };

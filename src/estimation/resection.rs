@@ -24,6 +24,9 @@ use crate::geometry::{Pose, View, rotation_exp};
 /// times two; 1 in 100).
 const AMBIGUOUS: f64 = 9.21;
 
+/// log10 of the false alarms from which on a view may be chance.
+const CHANCE: f64 = -3.0;
+
 /// What was known of a parameter before.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Prior {
@@ -145,10 +148,10 @@ struct Task {
 /// The view of the points, none of which is taken for a blunder.
 pub fn resect(view: &View, xyz: &[[f64; 3]], xy: &[[f64; 2]], options: &ResectionOptions) -> Result<Resection> {
     let task = Task::new(view, xyz, xy, options)?;
-    let o = task.all.select(&task.control);
+    let o = task.all.part(&task.control);
     let candidates = task.starts(&o)?;
     let mut fits: Vec<(Outcome<View>, Vec<usize>)> =
-        candidates.iter().filter_map(|c| task.fit_visible(&o, &c.view)).take(2).collect();
+        start::plausible(&candidates, o.len()).filter_map(|c| task.fit_visible(&o, &c.view)).take(2).collect();
     if task.options.start == Start::Given {
         // The start decides, but a view that explains the points as well must not go unseen.
         fits.truncate(1);
@@ -179,7 +182,7 @@ pub fn resect_robust(
     (criterion, significance): (Criterion, f64),
 ) -> Result<Resection> {
     let task = Task::new(view, xyz, xy, options)?;
-    let o = task.all.select(&task.control);
+    let o = task.all.part(&task.control);
     let radius = match criterion {
         Criterion::Threshold(t) => Some(t),
         // A view through three noisy points misses the others by more than their own noise.
@@ -193,7 +196,7 @@ pub fn resect_robust(
     let start = task.with_held(&found.view)?;
     let selection = select(&o, (&task.free, &task.priors), (&start, found.threshold), criterion, significance)?;
     task.check_redundancy(selection.used.len())?;
-    let supporters = o.select(&selection.used);
+    let supporters = o.part(&selection.used);
     let outcome = task.fit(&supporters, &selection.outcome.state).ok_or_else(|| task.no_fit(&o))?;
     let used: Vec<usize> = selection.used.iter().map(|&i| task.control[i]).collect();
     let second = task.rival(&supporters, &outcome.state);
@@ -308,8 +311,11 @@ impl Task {
     }
 
     fn fit(&self, o: &Observations, start: &View) -> Option<Outcome<View>> {
+        // What a search found is close.
+        let damping = if self.options.start == Start::Given { Limits::default().damping } else { 1e-8 };
+        let limits = Limits { damping, ..Limits::default() };
         let one = |loss: Loss, scale: f64, from: &View| {
-            fit(o, &self.free, &self.priors, (loss, scale), from, &Limits::default()).filter(|f| f.stop.converged())
+            fit(o, &self.free, &self.priors, (loss, scale), from, &limits).filter(|f| f.stop.converged())
         };
         if self.options.loss == Loss::Squares {
             return one(Loss::Squares, 1.0, start);
@@ -335,15 +341,16 @@ impl Task {
 
     /// Fits the points that the start sees, then those that come into view. The places that were used.
     fn fit_visible(&self, o: &Observations, start: &View) -> Option<(Outcome<View>, Vec<usize>)> {
-        let seen =
-            |view: &View| -> Vec<usize> { (0..o.len()).filter(|&i| view.project(&o.xyz[i]).is_some()).collect() };
+        let seen = |view: &View| -> Vec<usize> {
+            o.squares(view).iter().enumerate().filter(|(_, s)| s.is_finite()).map(|(i, _)| i).collect()
+        };
         let mut used = seen(start);
         let mut at = *start;
         for _ in 0..10 {
             if 2 * used.len() + self.priors.terms.len() < self.free.len() {
                 return None;
             }
-            let outcome = if used.len() == o.len() { self.fit(o, &at) } else { self.fit(&o.select(&used), &at) }?;
+            let outcome = self.fit(&o.part(&used), &at)?;
             at = outcome.state;
             let now = seen(&at);
             if now == used {
@@ -360,8 +367,7 @@ impl Task {
         if !pose_is_free || o.len() < 4 {
             return None;
         }
-        start::search(o, &view.camera, &FreeSet::pose(self.free.model()))
-            .iter()
+        start::plausible(&start::search(o, &view.camera, &FreeSet::pose(self.free.model())), o.len())
             .filter(|c| !alike(&c.view.pose, &view.pose, 0.01))
             .find_map(|c| self.fit(o, &c.view))
     }
@@ -388,7 +394,7 @@ impl Task {
         second: Option<Outcome<View>>,
         radius: Option<f64>,
     ) -> Result<Resection> {
-        let o = self.all.select(used);
+        let o = self.all.part(used);
         let local = outcome.state;
         let dof = (2 * o.len() + self.priors.terms.len()) as f64 - self.free.len() as f64;
         let scale = if self.options.loss == Loss::Squares || self.options.precision.is_some() {
@@ -431,6 +437,7 @@ impl Task {
             xyz: &o.xyz,
             typical_sigma: o.precision.typical_sigma(),
             sigma_known: self.options.precision.is_some(),
+            selected: used.len() < self.control.len(),
         };
         let predicted_errors = predicted_errors(&evidence);
         judge_fit(&evidence, predicted_errors, &mut verdict);
@@ -452,14 +459,14 @@ impl Task {
             self.free.len(),
             area,
         );
-        if dof >= 1.0 && alarms > -2.0 {
+        if dof >= 1.0 && alarms > CHANCE {
             let message = format!(
                 "{} of {} points within {largest:.1} px is what chance gives (10^{alarms:.1} such views expected): check the \
                  pairing of the points",
                 used.len(),
                 self.control.len()
             );
-            verdict.add("chance", true, (alarms, -2.0), message);
+            verdict.add("chance", true, (alarms, CHANCE), message);
         }
         let second = second.filter(|s| !alike(&s.state.pose, &local.pose, 1e-3)).filter(|s| {
             let (a, b) = (outcome.normal.cost.max(problem.rounding()), s.normal.cost);

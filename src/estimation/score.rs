@@ -138,7 +138,7 @@ impl<'a> Scorer<'a> {
         let better = best.is_none_or(|b| score.value < b.value);
         // The pace at the new threshold: inliers cost something, take them as half where it is not known.
         let share = score.inliers as f64 / self.observations.len() as f64;
-        better.then(|| Score { pace: 1.0 - 0.5 * share, ..score })
+        better.then_some(Score { pace: 1.0 - 0.5 * share, ..score })
     }
 
     fn fewest_false_alarms(&self, counts: &[usize; LEVELS + 1]) -> Score {

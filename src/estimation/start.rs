@@ -24,6 +24,9 @@ const REFINED: usize = 4;
 /// A candidate whose cost after a few steps is this many times the best one's is given up.
 const HOPELESS: f64 = 30.0;
 
+/// Twice the log-likelihood ratio beyond which a candidate is ruled out.
+const RULED_OUT: f64 = 30.0;
+
 /// A refined candidate.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Candidate {
@@ -89,8 +92,8 @@ pub(super) fn search(observations: &Observations, camera: &Camera, free: &FreeSe
             distinct.push(c);
         }
     }
-    let limits = Limits { iterations: 50, step: 1e-5, ..Limits::default() };
-    let first_look = Limits { iterations: 5, ..limits };
+    let limits = Limits { iterations: 50, step: 1e-4, ..Limits::default() };
+    let first_look = Limits { iterations: 4, ..limits };
     let mut refined: Vec<Candidate> = Vec::new();
     // The pose first, so that a wrong focal length does not run away with it.
     let pose = FreeSet::pose(camera.model());
@@ -115,6 +118,19 @@ pub(super) fn search(observations: &Observations, camera: &Camera, free: &FreeSe
     }
     refined.sort_by(|a, b| a.cost.total_cmp(&b.cost));
     refined
+}
+
+/// The best of the candidates, and those that may turn out as good on all points: the likelihood of the judging points
+/// rules the others out, whether the sigmas are right or unknown.
+pub(super) fn plausible(candidates: &[Candidate], n: usize) -> impl Iterator<Item = &Candidate> {
+    let judges = n.min(JUDGES) as f64;
+    let best = candidates.iter().map(|c| c.cost).fold(f64::INFINITY, f64::min);
+    candidates.iter().filter(move |c| {
+        let known = judges * (c.cost - best);
+        let unknown = (2.0 * judges - 6.0).max(1.0) * (c.cost / best).ln();
+        // A cost that is not known rules nothing out.
+        !(known > RULED_OUT && unknown > RULED_OUT)
+    })
 }
 
 /// Whether two poses see the points from nearly the same place: turned by less than `limit`, the centre moved by less

@@ -48,6 +48,9 @@ pub const HIGH_CORRELATION: f64 = 0.95;
 pub const SMALL_EXTENT: f64 = 0.1;
 /// The position error at the border, in units of the measuring error, above which control is too concentrated.
 pub const LARGE_BORDER_ERROR: f64 = 5.0;
+/// Residuals, as part of the photo's diagonal, that careful pointing does not leave; five times that is fatal, and
+/// with fewer than 9 points or so any excess.
+pub const LARGE_RESIDUALS: f64 = 0.001;
 /// The degrees of freedom below which nothing checks the view.
 pub const FEW_FREEDOMS: f64 = 4.0;
 
@@ -64,6 +67,8 @@ pub(super) struct Evidence<'a> {
     pub xyz: &'a [[f64; 3]],
     /// The geometric mean of the given sigmas, px.
     pub typical_sigma: f64,
+    /// Whether points were rejected.
+    pub selected: bool,
     /// Whether the sigmas were given.
     pub sigma_known: bool,
 }
@@ -71,6 +76,8 @@ pub(super) struct Evidence<'a> {
 /// The area that points enclose over the photo's, by their extent in 32 directions.
 pub fn extent(xy: &[[f64; 2]], width: u32, height: u32) -> f64 {
     const DIRECTIONS: usize = 32;
+    // Some thousands of points show the extent as well as all of them.
+    const ENOUGH: usize = 2048;
     if xy.len() < 3 {
         return 0.0;
     }
@@ -78,7 +85,8 @@ pub fn extent(xy: &[[f64; 2]], width: u32, height: u32) -> f64 {
         let angle = std::f64::consts::TAU * k as f64 / DIRECTIONS as f64;
         let (s, c) = angle.sin_cos();
         let reach = |p: &[f64; 2]| c * p[0] + s * p[1];
-        xy.iter().fold((f64::NEG_INFINITY, [0.0; 2]), |best, p| if reach(p) > best.0 { (reach(p), *p) } else { best }).1
+        let some = xy.iter().step_by(xy.len().div_ceil(ENOUGH));
+        some.fold((f64::NEG_INFINITY, [0.0; 2]), |best, p| if reach(p) > best.0 { (reach(p), *p) } else { best }).1
     };
     let hull: Vec<[f64; 2]> = (0..DIRECTIONS).map(far).collect();
     let o = hull[0];
@@ -124,7 +132,8 @@ pub(super) fn judge_fit(e: &Evidence<'_>, predicted: (f64, f64), verdict: &mut V
         verdict.add("no_redundancy", true, (e.dof, 1.0), message);
     } else if e.dof < FEW_FREEDOMS {
         let message = format!("only {:.0} redundant coordinates check the view: add control points", e.dof);
-        verdict.add("few_points", false, (e.dof, FEW_FREEDOMS), message);
+        // Where points were rejected, so few may agree by chance.
+        verdict.add("few_points", e.selected, (e.dof, FEW_FREEDOMS), message);
     }
     if e.sigma_known && e.dof >= 1.0 {
         // The square root of χ²/r at 99.9 %, by Wilson and Hilferty.
@@ -140,6 +149,18 @@ pub(super) fn judge_fit(e: &Evidence<'_>, predicted: (f64, f64), verdict: &mut V
         }
     }
     let camera = &e.view.camera;
+    let diagonal = f64::from(camera.width).hypot(f64::from(camera.height));
+    let residual = e.sigma0 * e.typical_sigma;
+    if residual > LARGE_RESIDUALS * diagonal {
+        let message = format!(
+            "the residuals of {residual:.1} px are {:.2} % of the photo's diagonal: points were measured badly or paired \
+             wrongly, or the camera does not fit",
+            100.0 * residual / diagonal
+        );
+        let limit = LARGE_RESIDUALS * diagonal;
+        // With few points a wrong view can leave no larger ones.
+        verdict.add("large_residuals", residual > 5.0 * limit || e.dof < 12.0, (residual, limit), message);
+    }
     let extent = extent(e.xy, camera.width, camera.height);
     if extent < SMALL_EXTENT {
         let message = format!(
@@ -184,17 +205,24 @@ pub fn highest_correlation(free: &FreeSet, covariance: &DMatrix<f64>) -> Option<
     highest
 }
 
-/// log10 of how many views chance would give, among `n` points thrown at random over the photo, that have `k` of them
-/// within a radius: the a-contrario number with the sample that determines `free` parameters.
+/// log10 of how many views chance would give, among `n` points thrown at random over the photo, that leave `k` of them
+/// residuals within a radius: the a-contrario number, with the sample that determines `free` parameters.
 pub fn log10_false_alarms(n: usize, k: usize, radius: f64, free: usize, area: f64) -> f64 {
+    /// Views that a sample can have, times radii that a search tries.
+    const TRIES: f64 = 4.0 * 24.0;
     let sample = free.div_ceil(2).min(k);
     let choose = |n: usize, k: usize| -> f64 {
         (0..k.min(n - k)).map(|i| ((n - i) as f64).log10() - ((i + 1) as f64).log10()).sum()
     };
-    let chance = (std::f64::consts::PI * radius * radius / area).clamp(1e-300, 1.0);
     // Half coordinates of the sample that the parameters do not need are left over for checking.
     let checking = k as f64 - 0.5 * free as f64;
-    choose(n, k) + choose(k, sample) + checking * chance.log10()
+    if checking <= 0.0 {
+        return choose(n, k);
+    }
+    // A fit draws its points closer than a view through the sample alone would have them.
+    let drawn = k as f64 / checking;
+    let chance = (std::f64::consts::PI * radius * radius * drawn / area).clamp(1e-300, 1.0);
+    TRIES.log10() + choose(n, k) + choose(k, sample) + checking * chance.log10()
 }
 
 #[cfg(test)]

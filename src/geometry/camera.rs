@@ -280,7 +280,7 @@ impl Camera {
         let Lens::Polynomial(lens) = &self.lens else {
             return self.project_with_jacobian(p).map(|j| (j.xy, j.d_point));
         };
-        if !(p.z > 0.0) {
+        if p.z <= 0.0 || p.z.is_nan() {
             return None;
         }
         let iz = 1.0 / p.z;

@@ -74,20 +74,18 @@ impl Polynomial {
     /// As [`Polynomial::distort`], with d(xd, yd)/d(x, y), which is symmetric: (xx, xy, yy).
     #[inline(always)]
     pub fn distort_with_slope(&self, x: f64, y: f64) -> Option<([f64; 2], [f64; 3])> {
-        let r2 = x * x + y * y;
-        if !(r2 <= self.max_r2) {
-            return None;
-        }
+        self.distort(x, y).map(|distorted| (distorted, self.slope_unchecked(x, y)))
+    }
+
+    #[inline(always)]
+    fn slope_unchecked(&self, x: f64, y: f64) -> [f64; 3] {
         let [k1, k2, p1, p2, k3, k4, k5, k6] = self.k;
+        let r2 = x * x + y * y;
         let per_denominator = 1.0 / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6)));
         let g = (1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))) * per_denominator;
         let dg = (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3) - g * (k4 + r2 * (2.0 * k5 + r2 * 3.0 * k6))) * per_denominator;
         let (px, py) = (2.0 * (p1 * x + p2 * y), 2.0 * (p1 * y + p2 * x));
-        let xd = x * g + p1 * 2.0 * x * y + p2 * (r2 + 2.0 * x * x);
-        let yd = y * g + p1 * (r2 + 2.0 * y * y) + p2 * 2.0 * x * y;
-        let slope =
-            [g + 2.0 * x * x * dg + py + 4.0 * p2 * x, 2.0 * x * y * dg + px, g + 2.0 * y * y * dg + py + 4.0 * p1 * y];
-        Some(([xd, yd], slope))
+        [g + 2.0 * x * x * dg + py + 4.0 * p2 * x, 2.0 * x * y * dg + px, g + 2.0 * y * y * dg + py + 4.0 * p1 * y]
     }
 
     pub fn derivatives(&self, x: f64, y: f64) -> Derivatives {
@@ -132,12 +130,12 @@ impl Polynomial {
         let mut error = miss(x, y);
         for _ in 0..50 {
             let size = error[0].hypot(error[1]);
-            let [[a, b], [c, d]] = self.derivatives(x, y).d_xy;
-            let det = a * d - b * c;
+            let [a, b, d] = self.slope_unchecked(x, y);
+            let det = a * d - b * b;
             if size == 0.0 || det.abs() < 1e-14 {
                 break;
             }
-            let (dx, dy) = ((d * error[0] - b * error[1]) / det, (a * error[1] - c * error[0]) / det);
+            let (dx, dy) = ((d * error[0] - b * error[1]) / det, (a * error[1] - b * error[0]) / det);
             let mut step = 1.0;
             let better = loop {
                 let (nx, ny) = (x - step * dx, y - step * dy);
@@ -182,10 +180,11 @@ impl Polynomial {
             } else {
                 low = r
             }
-            let slope = self.derivatives(r, 0.0).d_xy[0][0] - 6.0 * self.k[3] * r;
+            let slope = self.slope_unchecked(r, 0.0)[0] - 6.0 * self.k[3] * r;
             let newton = r - value / slope;
             let next = if slope > 0.0 && newton > low && newton < high { newton } else { 0.5 * (low + high) };
-            if (next - r).abs() <= 1e-15 * (1.0 + r) {
+            // A start for the iteration in the plane, which has its own end.
+            if (next - r).abs() <= 1e-7 * (1.0 + r) {
                 return next;
             }
             r = next;

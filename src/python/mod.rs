@@ -30,5 +30,6 @@ fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     estimation::register(m)?;
     dlt::register(m)?;
     matching::register(m)?;
+    estimation::register(m)?;
     Ok(())
 }

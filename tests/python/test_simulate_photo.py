@@ -73,7 +73,7 @@ def test_a_disc_is_imaged_where_projection_says(model: str) -> None:
 
 
 def test_every_camera_sees_the_same_colours() -> None:
-    scene = simulate("square", seed=5, photos=0, points=10).scene
+    scene = simulate("square", seed=5, draft=True, photos=0, points=10).scene
     pose = Pose.looking_at((1.0, -16.0, 1.7), (2.0, 0.0, 2.5))
     rng = np.random.default_rng(7)
     hits = None
@@ -97,7 +97,7 @@ def test_every_camera_sees_the_same_colours() -> None:
 
 def test_true_colours_are_the_photo_s_where_surfaces_are_seen_whole() -> None:
     simulation = simulate(
-        "square", seed=2, size=(480, 320), photos=1, points=40_000, response=Response().without_noise()
+        "square", seed=2, draft=True, size=(480, 320), photos=1, points=40_000, response=Response().without_noise()
     )
     photo, truth = simulation.photos[0], simulation.scan_truth
     points = truth.surface[photo.visible(truth.surface)]
@@ -124,7 +124,7 @@ def test_the_errors_put_in_are_the_difference_between_true_and_approximate_view(
         focal=0.01,
         distortion={"k1": -0.05, "p2": 1e-3},
     )
-    photo = simulate("trial", seed=1, size=(64, 48), points=2000, disturbance=errors).photos[0]
+    photo = simulate("trial", seed=1, draft=True, size=(64, 48), points=2000, disturbance=errors).photos[0]
     start, view = photo.start, photo.view
     assert start.pose is not None and view.pose is not None and start.camera is not None and view.camera is not None
     np.testing.assert_allclose(view.pose.centre - start.pose.centre, [0.1, -0.2, 0.05], atol=1e-12)
@@ -140,7 +140,7 @@ def test_the_errors_put_in_are_the_difference_between_true_and_approximate_view(
     assert after["k1"] - before["k1"] == pytest.approx(-0.05)
     assert after["p2"] - before["p2"] == pytest.approx(1e-3)
     with pytest.raises(InvalidInputError, match="no term k9"):
-        simulate("trial", seed=1, size=(64, 48), points=20, disturbance=Disturbance(distortion={"k9": 1.0}))
+        simulate("trial", seed=1, draft=True, size=(64, 48), points=20, disturbance=Disturbance(distortion={"k9": 1.0}))
 
 
 def residuals(view: View, points: tuple[ControlPoint, ...]) -> np.ndarray:
@@ -150,7 +150,7 @@ def residuals(view: View, points: tuple[ControlPoint, ...]) -> np.ndarray:
 
 def test_control_points_have_the_noise_and_the_blunders_that_were_asked_for() -> None:
     errors = Disturbance(blunders=0.25, point_sigma_xy=0.5, point_sigma_xyz=0.0, control_points=8, check_points=4)
-    photo = simulate("trial", seed=2, size=(640, 480), points=2000, disturbance=errors).photos[0]
+    photo = simulate("trial", seed=2, draft=True, size=(640, 480), points=2000, disturbance=errors).photos[0]
     assert len(photo.blunders) == 2
     np.testing.assert_allclose(residuals(photo.view, photo.true_points), 0.0, atol=1e-9)
     assert [p.role for p in photo.points].count("check") == 4
@@ -162,7 +162,7 @@ def test_control_points_have_the_noise_and_the_blunders_that_were_asked_for() ->
 
 @pytest.mark.parametrize("name", sorted(SCENES))
 def test_every_scene_has_what_it_is_for(name: str) -> None:
-    simulation = simulate(name, seed=1, size=(150, 100), photos=1, points=8000)
+    simulation = simulate(name, seed=1, draft=True, size=(150, 100), photos=1, points=8000)
     photo = simulation.photos[0]
     assert len(simulation.scan) > 3000
     assert simulation.scan.intensity is not None
@@ -202,7 +202,7 @@ def test_noise_has_the_sigma_that_it_says() -> None:
 
 @pytest.fixture(scope="module")
 def still() -> Simulation:
-    return simulate("trial", seed=4, size=(160, 120), points=3000)
+    return simulate("trial", seed=4, draft=True, size=(160, 120), points=3000)
 
 
 def test_one_thread_and_many_give_the_same_picture(still: Simulation) -> None:

@@ -15,8 +15,8 @@ from .materials import Material, colour
 def ground(
     b: Builder, rng: np.random.Generator, *, pavement: float, behind: float = 0.3, kerb: bool = True, half: float = 70.0
 ) -> None:
-    """A pavement in front of the house line y = 0, a kerb, a road, and setts beyond. The street lies at y < 0; the pavement
-    reaches ``behind`` the house line."""
+    """A pavement in front of the house line y = 0, a kerb, a road, and setts beyond. The street lies at y < 0; the
+    pavement reaches ``behind`` the house line."""
     b.named("ground")
     _strip(b, half, -pavement, behind, 0.0, materials.slabs(rng))
     step = -0.12 if kerb else 0.0

@@ -19,7 +19,7 @@ def _plate(b: Builder, centre: Vector, size: float, material: Material, across: 
 def circular(
     b: Builder, name: str, centre: Vector, size: float = 0.15, across: Vector = (1, 0, 0), upward: Vector = (0, 0, 1)
 ) -> None:
-    """A blue plate with a white disc; ``across`` and ``upward`` are unit vectors in the plate, its front their product."""
+    """A blue plate with a white disc; ``across`` and ``upward`` are unit vectors in it, its front their product."""
     middle = (0.5 * size, 0.5 * size)
     material = Material((materials.fill(_BLUE), materials.ring(_WHITE, middle, 0.0, 0.3 * size)), gloss=0.01)
     _plate(b, centre, size, material, across, upward)

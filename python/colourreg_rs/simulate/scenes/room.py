@@ -152,12 +152,12 @@ def room(rng: np.random.Generator) -> Layout:
         (0, 1.5, 0),
         Material((*rug.layers, materials.noise(0.2, 0.006, octaves=2, seed=4))),
     )
-    for name, wall_frame, at in (
-        ("T1", north, (long - 0.35, 1.9)), ("T2", east, (0.3, 1.7)), ("T3", west, (wide - 0.35, 2.3)), ("T4", south, (0.5 * long, 1.1)),
-        ("T5", north, (0.16, 1.6)), ("T6", east, (wide - 0.35, 2.2)),
-    ):  # fmt: skip
+    places = [(north, long - 0.35, 1.9), (east, 0.3, 1.7), (west, wide - 0.35, 2.3), (south, 0.5 * long, 1.1)]
+    places += [(north, 0.16, 1.6), (east, wide - 0.35, 2.2)]
+    for i, (wall_frame, x, z) in enumerate(places, start=1):
+        name = f"T{i}"
         wall_frame.named(f"target {name}")
-        targets.quartered(wall_frame, name, (at[0], -0.004, at[1]), 0.13)
+        targets.quartered(wall_frame, name, (x, -0.004, z), 0.13)
 
     outside = materials.grass(rng)
     b.named("outside")

@@ -1,5 +1,5 @@
-"""A trial set-up in the laboratory: boxes on a bench before a wall, with circular and black-and-white targets, about 1.5 m
-from scanner and camera; some 80,000 points."""
+"""A trial set-up in the laboratory: boxes on a bench before a wall, with circular and black-and-white targets, about
+1.5 m from scanner and camera; some 80,000 points."""
 
 from __future__ import annotations
 

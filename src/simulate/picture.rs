@@ -312,6 +312,10 @@ impl Scene {
                         count += 1.0;
                     }
                 }
+                if count == 0.0 {
+                    // A surface so small that only the middle meets it.
+                    return self.look(&Sample { from, ray: &middle, angle, sun: &suns[0] }, known, true).0;
+                }
                 sum.map(|s| s / count)
             })
             .collect()
@@ -383,15 +387,17 @@ struct Block {
 
 impl<'a, R: Rays> Field<'a, R> {
     fn new(rays: &'a R, width: usize, rows: std::ops::Range<usize>) -> Self {
+        // Blocks lie alike whatever rows are asked for: the same pixel gets the same rays.
+        let first_row = rows.start / BLOCK * BLOCK;
         let across = width.div_ceil(BLOCK);
-        let down = rows.len().div_ceil(BLOCK);
+        let down = (rows.end - first_row).div_ceil(BLOCK);
         let half = 0.5 * BLOCK as f64;
         let blocks = (0..across * down)
             .into_par_iter()
             .with_min_len(64)
             .map(|i| {
                 let x = (i % across * BLOCK) as f64 - 0.5 + half;
-                let y = (rows.start + i / across * BLOCK) as f64 - 0.5 + half;
+                let y = (first_row + i / across * BLOCK) as f64 - 0.5 + half;
                 let angle = pixel_angle(rays, x, y);
                 let mut nodes = [Vector3::zeros(); 9];
                 let mut inside = angle < WIDE;
@@ -405,7 +411,7 @@ impl<'a, R: Rays> Field<'a, R> {
                 Block { middle: [x, y], nodes: inside.then_some(nodes), angle }
             })
             .collect();
-        Self { rays, first_row: rows.start, across, blocks }
+        Self { rays, first_row, across, blocks }
     }
 
     fn block(&self, x: usize, y: usize) -> &Block {

@@ -7,7 +7,7 @@ use rayon::prelude::*;
 
 use super::bvh::Bvh;
 use super::image::Painting;
-use super::light::{LightMap, Lighting};
+use super::light::{LightMap, Lighting, lamps};
 use super::material::{Material, Reflectance, Spot};
 use super::shape::Primitive;
 
@@ -18,6 +18,7 @@ pub struct Scene {
     pub(super) materials: Vec<Material>,
     pub(super) paintings: Vec<Painting>,
     pub(super) lighting: Lighting,
+    pub(super) lamps: Vec<u32>,
     tree: Bvh,
     light_map: OnceLock<LightMap>,
 }
@@ -46,7 +47,10 @@ impl Scene {
         lighting: Lighting,
     ) -> Self {
         let tree = Bvh::new(&primitives);
-        Self { primitives, materials, paintings, lighting, tree, light_map: OnceLock::new() }
+        let mut scene =
+            Self { primitives, materials, paintings, lighting, lamps: Vec::new(), tree, light_map: OnceLock::new() };
+        scene.lamps = lamps(&scene);
+        scene
     }
 
     /// How many primitives it has.
@@ -67,6 +71,11 @@ impl Scene {
     #[inline]
     pub(super) fn nearest(&self, from: &Vector3<f64>, ray: &Vector3<f64>, near: f64, far: f64) -> Option<(f64, u32)> {
         self.tree.nearest(&self.primitives, from, ray, near, far)
+    }
+
+    #[inline]
+    pub(super) fn blocked(&self, from: &Vector3<f64>, ray: &Vector3<f64>, near: f64, far: f64) -> bool {
+        self.tree.blocked(&self.primitives, from, ray, near, far)
     }
 
     /// Whether the sun shines on a point, `facing` being the unit normal on its lit side.

@@ -211,15 +211,26 @@ impl Primitive {
         [a + self.uv[0], b + self.uv[1]]
     }
 
-    /// Number of cells, of about `spacing` metres, of a grid over the surface.
+    /// Length of the grid's two directions over the surface, metres.
+    pub fn grid_lengths(&self) -> [f64; 2] {
+        match self.outline {
+            Outline::Ellipse | Outline::Leaf => self.lengths.map(|length| 2.0 * length),
+            Outline::Frustum => [6.3 * self.v.x.max(self.v.y), self.lengths[0]],
+            Outline::Sphere => [6.3 * self.v.x, 3.1 * self.v.x],
+            _ => self.lengths,
+        }
+    }
+
+    /// Number of nodes, about `spacing` metres apart, of a grid over the surface.
     pub fn grid_size(&self, spacing: f64, most: usize) -> [usize; 2] {
-        let cells = |length: f64| ((length / spacing).round() as usize).clamp(1, most);
+        let nodes = self.grid_lengths().map(|length| {
+            if length < 0.5 * spacing { 1 } else { ((length / spacing).round() as usize + 1).clamp(2, most) }
+        });
         match self.outline {
             Outline::Leaf => [1, 1],
-            Outline::Ellipse => [cells(2.0 * self.lengths[0]), cells(2.0 * self.lengths[1])],
-            Outline::Frustum => [cells(6.3 * self.v.x.max(self.v.y)).max(6), cells(self.lengths[0])],
+            Outline::Frustum => [nodes[0].max(6), nodes[1]],
             Outline::Sphere => [8, 5],
-            _ => [cells(self.lengths[0]), cells(self.lengths[1])],
+            _ => nodes,
         }
     }
 

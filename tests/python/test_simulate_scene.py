@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from colourreg_rs import _core
 from colourreg_rs.errors import InvalidInputError
-from colourreg_rs.simulate import Frame, Simulation, simulate
+from colourreg_rs.io.clouds import read_cloud
+from colourreg_rs.io.points import read_points
+from colourreg_rs.io.registration import read_registration
+from colourreg_rs.simulate import Frame, Simulation, simulate, write_simulation
 
 
 @pytest.fixture(scope="module")
 def square() -> Simulation:
-    return simulate("square", seed=3, size=(360, 240), photos=1, points=60_000)
+    return simulate("square", seed=3, draft=True, size=(360, 240), photos=1, points=60_000)
 
 
 def test_scan_points_lie_on_their_surfaces_up_to_the_stated_noise(square: Simulation) -> None:
@@ -57,7 +63,7 @@ def test_visibility_agrees_with_the_depth_image(square: Simulation) -> None:
 
 
 def test_the_same_seed_gives_the_same_bits_and_another_another_scene(square: Simulation) -> None:
-    again = simulate("square", seed=3, size=(360, 240), photos=1, points=60_000)
+    again = simulate("square", seed=3, draft=True, size=(360, 240), photos=1, points=60_000)
     np.testing.assert_array_equal(again.scan.xyz, square.scan.xyz)
     np.testing.assert_array_equal(again.photos[0].image, square.photos[0].image)
     np.testing.assert_array_equal(again.photos[0].points[0].xy, square.photos[0].points[0].xy)
@@ -66,16 +72,16 @@ def test_the_same_seed_gives_the_same_bits_and_another_another_scene(square: Sim
 
 
 def test_the_options_do_not_change_the_scene(square: Simulation) -> None:
-    other = simulate("square", seed=3, size=(90, 60), photos=1, points=10_000)
+    other = simulate("square", seed=3, draft=True, size=(90, 60), photos=1, points=10_000)
     assert other.scene.parts.rows == square.scene.parts.rows
     np.testing.assert_array_equal(other.photos[0].start.pose.rotation, square.photos[0].start.pose.rotation)
 
 
 def test_a_georeferenced_frame_shows_the_same_picture(square: Simulation) -> None:
     frame = Frame.turned(0.7, (500_000.0, 5_000_000.0, 100.0))
-    moved = simulate("square", seed=3, size=(360, 240), photos=1, points=60_000, frame=frame)
+    moved = simulate("square", seed=3, draft=True, size=(360, 240), photos=1, points=60_000, frame=frame)
     a, b = square.photos[0], moved.photos[0]
-    np.testing.assert_allclose(frame.to_scene(moved.scan.xyz), square.scan.xyz, atol=1e-7)
+    np.testing.assert_allclose(frame.to_scene(moved.scan.xyz), square.scan.xyz, atol=1e-5)
     difference = np.abs(a.image.astype(int) - b.image.astype(int)).max(axis=2)
     assert (difference > 3).mean() < 0.01
     here, _ = _core.project(a.view.core, square.scan_truth.surface)
@@ -101,3 +107,31 @@ def test_what_does_not_exist_is_refused_in_one_line() -> None:
         simulate("moon")
     with pytest.raises(InvalidInputError, match="2 viewpoints, 9 photos wanted"):
         simulate("square", photos=9, points=10)
+
+
+def test_what_is_written_can_be_read_and_projects_rightly(tmp_path: Path) -> None:
+    frame = Frame.turned(0.3, (500_000.0, 5_000_000.0, 100.0))
+    simulation = simulate("trial", seed=6, draft=True, size=(320, 240), points=20_000, frame=frame)
+    files = write_simulation(simulation, tmp_path / "out")
+    assert {f.name for f in files} == {
+        "scan.laz",
+        "photo-1.jpg",
+        "photo-1-points.csv",
+        "photo-1-camera.json",
+        "start.json",
+        "truth.json",
+        "simulation.json",
+    }
+    cloud = read_cloud(tmp_path / "out" / "scan.laz")
+    np.testing.assert_allclose(cloud.xyz, simulation.scan.xyz, atol=1e-4)
+    np.testing.assert_array_equal(cloud.intensity, simulation.scan.intensity)
+    truth, start = (read_registration(tmp_path / "out" / n).views[0] for n in ("truth.json", "start.json"))
+    xyz, xy = np.array([p.xyz for p in truth.points]), np.array([p.xy for p in truth.points])
+    np.testing.assert_allclose(_core.project(truth.core, xyz)[0], xy, atol=1e-4)
+    assert np.abs(_core.project(start.core, xyz)[0] - xy).max() > 1.0
+    measured = read_points(tmp_path / "out" / "photo-1-points.csv")
+    assert [p.name for p in measured] == [p.name for p in truth.points]
+    assert truth.image is not None
+    assert truth.image.is_file()
+    what = json.loads((tmp_path / "out" / "simulation.json").read_text())
+    assert what["photos"][0]["translation"] == pytest.approx((truth.pose.centre - start.pose.centre).tolist(), abs=1e-6)

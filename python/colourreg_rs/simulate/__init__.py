@@ -8,6 +8,7 @@ from .scanner import Scanner, ScanTruth
 from .scene import Frame, Hits, Scene
 from .scenes import SCENES
 from .simulation import Simulation, simulate
+from .write import write_simulation
 
 __all__ = [
     "SCENES",
@@ -21,4 +22,5 @@ __all__ = [
     "SimulatedPhoto",
     "Simulation",
     "simulate",
+    "write_simulation",
 ]

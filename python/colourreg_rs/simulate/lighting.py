@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -29,6 +29,12 @@ class Lighting:
     map_spacing: float = 0.4
     map_directions: int = 48
     bounces: int = 1
+
+    def draft(self) -> Lighting:
+        """The same light, gathered coarsely."""
+        return replace(
+            self, map_spacing=2.5 * self.map_spacing, map_directions=max(self.map_directions // 4, 12), bounces=0
+        )
 
     def row(self) -> npt.NDArray[np.float64]:
         """The numbers in the core's order."""

@@ -44,8 +44,8 @@ class Response:
         grey = grey[grey > 0]
         if len(grey) == 0:
             return replace(self, exposure=1.0)
-        median, bright = np.percentile(grey, [50, 92])
-        return replace(self, exposure=float(min(0.21 / max(median, 1e-4), 0.78 / max(bright, 1e-4))))
+        median, bright = np.percentile(grey, [50, 93])
+        return replace(self, exposure=float(min(0.24 / max(median, 1e-4), 1.0 / max(bright, 1e-4))))
 
     def fall_off(self, xy: FloatArray, width: int, height: int) -> FloatArray:
         """The part of the light that reaches pixels (..., 2) away from the middle."""
@@ -145,7 +145,7 @@ def blurred(image: npt.NDArray[np.float32], sigma: float) -> npt.NDArray[np.floa
     """A Gaussian blur of ``sigma`` pixels; the border repeats its edge."""
     if sigma <= 0:
         return image
-    radius = max(int(np.ceil(4.0 * sigma)), 1)
+    radius = int(np.ceil(4.0 * sigma)) + 2
     # The discrete Gaussian (Lindeberg 1990): its variance is sigma² however small that is, unlike a sampled one's.
     frequency = 2.0 * np.pi * np.fft.rfftfreq(64 * radius)
     kernel = np.fft.fftshift(np.fft.irfft(np.exp(sigma**2 * (np.cos(frequency) - 1.0))))

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..errors import InvalidInputError
 from ..model import CameraModel, PointCloud, View
+from ..progress import Progress, silent
 from .disturbance import Disturbance
 from .photo import Response, SimulatedPhoto, develop, radiance
 from .scanner import Scanner, ScanTruth, scan
@@ -48,24 +49,25 @@ def simulate(
     points: int | None = None,
     frame: Frame | None = None,
     samples: int = 16,
-    progress: Callable[[str], None] | None = None,
+    draft: bool = False,
+    progress: Progress = silent,
 ) -> Simulation:
     """Simulates a scan and photos of one of :data:`SCENES`.
 
     The same name, seed and options give the same bits. ``photos`` and ``size`` (width, height in pixels) change the
     number and size of photos, ``points`` the number of the scanner's directions; ``scanner`` changes anything about the
-    instrument; ``frame`` sets the scene up elsewhere in the world (a turned or georeferenced frame). Raises
-    InvalidInputError for a scene that does not exist or options that do not fit.
+    instrument; ``frame`` sets the scene up elsewhere in the world (a turned or georeferenced frame). Edges in the
+    photos are sampled ``samples`` times per pixel. A ``draft`` gathers the sky's light coarsely: quicker, plainer,
+    geometrically the same. Raises InvalidInputError for a scene that does not exist or options that do not fit.
     """
     if scene_name not in SCENES:
         raise InvalidInputError(f"there is no scene {scene_name!r}; choose one of {', '.join(SCENES)}")
-    say = progress or (lambda _: None)
     disturbance, response = disturbance or Disturbance(), response or Response()
     frame = frame or Frame()
     # One stream of randomness for each purpose: another photo size must not change the scene.
     streams = np.random.default_rng([zlib.crc32(scene_name.encode()), seed]).spawn(4)
     layout = SCENES[scene_name](streams[0])
-    scene = Scene(scene_name, layout.parts, layout.lighting, frame)
+    scene = Scene(scene_name, layout.parts, layout.lighting.draft() if draft else layout.lighting, frame)
     instrument = layout.scanner
     if points is not None:
         if points < 1:
@@ -74,16 +76,17 @@ def simulate(
         instrument = replace(instrument, step=float(np.sqrt(field / points)))
     if scanner is not None:
         instrument = scanner(instrument)
-    say("scan")
+    viewpoints = layout.viewpoints if photos is None else layout.viewpoints[:photos]
+    if photos is not None and not 0 <= photos <= len(layout.viewpoints):
+        raise InvalidInputError(f"scene {scene_name} has {len(layout.viewpoints)} viewpoints, {photos} photos wanted")
+    steps = 1 + len(viewpoints)
+    progress("simulate: scan", 0, steps)
     stations = [frame.to_world(s) for s in layout.stations]
     cloud, truth = scan(scene, stations, instrument, streams[1])
-    viewpoints = layout.viewpoints if photos is None else layout.viewpoints[:photos]
-    if photos is not None and photos > len(viewpoints):
-        raise InvalidInputError(f"scene {scene_name} has {len(layout.viewpoints)} viewpoints, {photos} photos wanted")
     taken = []
     generators = streams[2].spawn(len(layout.viewpoints))
     for i, (viewpoint, rng) in enumerate(zip(viewpoints, generators, strict=False), start=1):
-        say(f"photo {i}")
+        progress(f"simulate: photo {i}", i, steps)
         name = f"photo-{i}"
         camera = viewpoint.camera(camera_model, size)
         errors, pixels, picks = rng.spawn(3)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from . import artwork, materials, plants
@@ -10,16 +12,28 @@ from .buildings import poster_board
 from .materials import Material, colour
 
 
-def ground(b: Builder, rng: np.random.Generator, *, pavement: float, kerb: bool = True, half: float = 70.0) -> None:
-    """A pavement in front of the house line y = 0, a kerb, a road, and setts beyond. The street lies at y < 0."""
+def ground(
+    b: Builder, rng: np.random.Generator, *, pavement: float, behind: float = 0.3, kerb: bool = True, half: float = 70.0
+) -> None:
+    """A pavement in front of the house line y = 0, a kerb, a road, and setts beyond. The street lies at y < 0; the
+    pavement reaches ``behind`` the house line."""
     b.named("ground")
-    b.rectangle((-half, -pavement, 0), (2 * half, 0, 0), (0, pavement + 30, 0), materials.slabs(rng), (0, 0))
+    _strip(b, half, -pavement, behind, 0.0, materials.slabs(rng))
     step = -0.12 if kerb else 0.0
     if kerb:
         b.box((-half, -pavement - 0.15, -0.12), (half, -pavement, 0.005), materials.stone(rng), open_faces=("-z", "+y"))
     edge = -pavement - (0.15 if kerb else 0.0)
-    b.rectangle((-half, edge - 7.0, step), (2 * half, 0, 0), (0, 7.0, 0), materials.asphalt(rng))
-    b.rectangle((-half, edge - 60.0, step), (2 * half, 0, 0), (0, 53.0, 0), materials.cobbles(rng))
+    _strip(b, half, edge - 7.0, edge, step, materials.asphalt(rng))
+    setts = materials.cobbles(rng)
+    _strip(b, half, edge - 22.0, edge - 7.0, step, setts)
+    b.rectangle((-half, edge - 60.0, step), (2 * half, 0, 0), (0, 38.0, 0), setts, (-half, edge - 60.0))
+
+
+def _strip(b: Builder, half: float, y0: float, y1: float, z: float, material: Material) -> None:
+    """Ground in pieces that are small near the middle, so that light is gathered finely there."""
+    edges = [-half, -18.0, -6.0, 6.0, 18.0, half]
+    for x0, x1 in pairwise(edges):
+        b.rectangle((x0, y0, z), (x1 - x0, 0, 0), (0, y1 - y0, 0), material, (x0, y0))
 
 
 def lamp_post(b: Builder, foot: tuple[float, float, float], rng: np.random.Generator) -> None:

@@ -7,11 +7,17 @@ from collections.abc import Callable
 import numpy as np
 
 from ..layout import Layout
+from .corner import corner
 from .facade import facade
+from .room import room
 from .square import demo, square
+from .trial import trial
 
 SCENES: dict[str, Callable[[np.random.Generator], Layout]] = {
+    "corner": corner,
     "demo": demo,
     "facade": facade,
+    "room": room,
     "square": square,
+    "trial": trial,
 }

@@ -80,14 +80,23 @@ pub fn patch(
             )));
         }
     }
-    let end = length + gap;
+    // The end of the new row need not be cleared where columns cover it; they may not overlap to be counted on for that.
+    let mut places: Vec<(usize, usize)> = columns.iter().map(|c| (c.at, c.at + c.width)).collect();
+    places.sort_unstable();
+    let start = if split == length { length } else { length + gap };
+    let covered = places.iter().fold(start, |to, &(at, end)| if at <= to { to.max(end) } else { to }) >= new_length;
     records.par_chunks(length * BLOCK).zip(out.par_chunks_mut(new_length * BLOCK)).enumerate().for_each(
         |(block, (records, out))| {
-            for (old, new) in records.chunks_exact(length).zip(out.chunks_exact_mut(new_length)) {
-                new[..split].copy_from_slice(&old[..split]);
-                new[split..split + gap].fill(0);
-                new[split + gap..end].copy_from_slice(&old[split..]);
-                new[end..].fill(0);
+            if gap == 0 || split == length {
+                widen(records, length, out, new_length, !covered);
+            } else {
+                let end = length + gap;
+                for (old, new) in records.chunks_exact(length).zip(out.chunks_exact_mut(new_length)) {
+                    new[..split].copy_from_slice(&old[..split]);
+                    new[split..split + gap].fill(0);
+                    new[split + gap..end].copy_from_slice(&old[split..]);
+                    new[end..].fill(0);
+                }
             }
             for column in columns {
                 let width = column.width;
@@ -107,6 +116,41 @@ pub fn patch(
         },
     );
     Ok(())
+}
+
+/// Copies rows to the start of longer ones. Lengths known to the compiler are copied without a call for each row.
+fn widen(old: &[u8], length: usize, new: &mut [u8], new_length: usize, clear: bool) {
+    fn fixed<const L: usize>(old: &[u8], new: &mut [u8], new_length: usize) {
+        for (old, new) in old.as_chunks::<L>().0.iter().zip(new.chunks_exact_mut(new_length)) {
+            new[..L].copy_from_slice(old);
+        }
+    }
+    match length {
+        // The records of LAS without extra bytes, and with those of a first colouring; coordinates or colours alone.
+        6 => fixed::<6>(old, new, new_length),
+        12 => fixed::<12>(old, new, new_length),
+        20 => fixed::<20>(old, new, new_length),
+        24 => fixed::<24>(old, new, new_length),
+        26 => fixed::<26>(old, new, new_length),
+        28 => fixed::<28>(old, new, new_length),
+        30 => fixed::<30>(old, new, new_length),
+        32 => fixed::<32>(old, new, new_length),
+        34 => fixed::<34>(old, new, new_length),
+        36 => fixed::<36>(old, new, new_length),
+        38 => fixed::<38>(old, new, new_length),
+        40 => fixed::<40>(old, new, new_length),
+        42 => fixed::<42>(old, new, new_length),
+        _ => {
+            for (old, new) in old.chunks_exact(length).zip(new.chunks_exact_mut(new_length)) {
+                new[..length].copy_from_slice(old);
+            }
+        }
+    }
+    if clear {
+        for row in new.chunks_exact_mut(new_length) {
+            row[length..].fill(0);
+        }
+    }
 }
 
 /// Writes values of a width known to the compiler into rows: twice as fast as the general case.

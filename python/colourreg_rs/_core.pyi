@@ -348,9 +348,9 @@ class Exposure:
     def gains(self) -> FloatArray:
         """(V, 3), one for each photo and channel; 1 for a photo that shares no points with others."""
 
-def scaled_xyz(records: npt.NDArray[np.uint8], scale: FloatArray, offset: FloatArray) -> FloatArray:
-    """Coordinates (N, 3) of LAS point records (N, L), L >= 12: the three little-endian 32-bit integers at the start of
-    each row, times ``scale`` (3,), plus ``offset`` (3,). Raises InvalidInputError for shorter rows."""
+def scaled_xyz(records: npt.NDArray[np.uint8], scale: FloatArray, offset: FloatArray, out: FloatArray) -> None:
+    """Coordinates of LAS point records (N, L), L >= 12, into ``out`` (N, 3): the three little-endian 32-bit integers at
+    the start of each row, times ``scale`` (3,), plus ``offset`` (3,). Raises InvalidInputError for shorter rows."""
 
 def patch_records(
     records: npt.NDArray[np.uint8],

@@ -1,9 +1,9 @@
 //! What reading and writing files leaves to the core: rows of bytes, and the LZF decompression.
 
-use numpy::{PyArray1, PyArray2};
+use numpy::PyArray1;
 use pyo3::prelude::*;
 
-use super::arrays::{Input, Output, owned_rows, vector};
+use super::arrays::{Input, Output, vector};
 use crate::lzf;
 use crate::records::{self, Column};
 
@@ -13,15 +13,15 @@ fn scaled_xyz<'py>(
     records: &Bound<'py, PyAny>,
     scale: &Bound<'py, PyAny>,
     offset: &Bound<'py, PyAny>,
-) -> PyResult<Bound<'py, PyArray2<f64>>> {
+    out: &Bound<'py, PyAny>,
+) -> PyResult<()> {
     let records = Input::<u8>::new(records, "records", &[None, None])?;
     let (scale, offset) = (vector::<3>(scale, "scale")?, vector::<3>(offset, "offset")?);
     let (rows, length, bytes) = (records.shape()[0], records.shape()[1], records.values()?);
-    let xyz = py.detach(|| {
-        let mut xyz = vec![[0.0; 3]; rows];
-        records::scaled_xyz(bytes, length, scale, offset, &mut xyz).map(|()| xyz)
-    })?;
-    owned_rows(py, xyz)
+    let mut out = Output::<f64>::new(out, "out", &[Some(rows), Some(3)])?;
+    let xyz = out.rows::<3>()?;
+    py.detach(|| records::scaled_xyz(bytes, length, scale, offset, xyz))?;
+    Ok(())
 }
 
 #[pyfunction]

@@ -197,7 +197,8 @@ class LasChunk(CloudChunk):
         self.record = (records, block)
         self.positions = records
         self.block = block
-        self.xyz = _core.scaled_xyz(records, np.array(header.scale), np.array(header.offset))
+        self.xyz = np.empty((len(records), 3))  # of numpy's own, as it asks the system for large pages
+        _core.scaled_xyz(records, np.array(header.scale), np.array(header.offset), self.xyz)
         self._reader = reader
         self._complete = complete
 

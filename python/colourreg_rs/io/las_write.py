@@ -179,7 +179,11 @@ class LasOutput(CloudWriter):
             parts.insert(
                 1, np.zeros((len(chunk), 2), np.uint8)
             )  # the infrared, which is not exchanged where there is one
-        self._sink.write_block(self._splicer.splice(block, chunk.positions, np.concatenate(parts, axis=1)))
+        first, *others = parts
+        ends = np.cumsum([first.shape[1], *(part.shape[1] for part in others)]).tolist()
+        values = np.empty((len(chunk), ends[-1]), np.uint8)
+        _core.patch_records(first, first.shape[1], 0, list(zip(ends, others, strict=False)), values)
+        self._sink.write_block(self._splicer.splice(block, chunk.positions, values))
 
     def _begin(self, given: tuple[bool, bool, bool], chunk: LasChunk | None) -> None:
         """Writes the header, now that it is known what is added."""

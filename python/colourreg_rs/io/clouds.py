@@ -25,6 +25,10 @@ AnyArray = npt.NDArray[Any]
 #: Points in a chunk where nobody asks for another number.
 CHUNK_SIZE = 1_000_000
 
+#: Points that are read at a time at most where the file leaves the choice: arrays of this size are handed out by the
+#: allocator again and again, while each larger one is asked of the system anew, page by page.
+PIECE = 1 << 18
+
 #: Names, types and descriptions of the dimensions that colouring adds.
 SOURCE_NAME, SOURCE_TYPE, SOURCE_TEXT = "ColourSource", "<u2", "view of the colour, 0 = none"
 SIGMA_NAME, SIGMA_TYPE, SIGMA_TEXT = "ColourSigma", "<f4", "sigma of colour's position, m"
@@ -117,6 +121,8 @@ class CloudReader(ABC):
     @abstractmethod
     def chunks(self, size: int = CHUNK_SIZE, positions_only: bool = False) -> Iterator[CloudChunk]:
         """All points in order, at most ``size`` at a time; a new iteration starts at the first point again.
+
+        Fewer than ``size`` may come where that is faster. Iterations may overlap, in several threads too.
 
         With ``positions_only`` nothing but ``xyz`` need be there, which saves decoding the rest.
         """

@@ -17,7 +17,7 @@ from .. import _core
 from ..errors import FileError
 from . import laz
 from .atomic import open_binary, reason, reopen
-from .clouds import CHUNK_SIZE, AnyArray, Attribute, CloudChunk, CloudReader
+from .clouds import CHUNK_SIZE, PIECE, AnyArray, Attribute, CloudChunk, CloudReader
 from .las_header import (
     RAISED,
     RGB_OFFSET,
@@ -130,6 +130,7 @@ class LasReader(CloudReader):
         start = 0
         if self.laz is None:
             length = self.header.record_length
+            size = min(size, PIECE)
             while start < self.n_points:
                 count = min(size, self.n_points - start)
                 file.seek(self.header.point_offset + start * length)
@@ -140,6 +141,8 @@ class LasReader(CloudReader):
                 start += count
         elif self.laz.largest <= size and self.laz.table:
             layered = self.laz.scheme.layered
+            # Enough blocks to keep all processors busy until the last of them.
+            size = min(size, self.laz.largest * max(8, 4 * (os.cpu_count() or 1)))
             selection = laz.POSITIONS if positions_only else laz.POSITIONS_AND_COLOUR
             for block in self.laz.blocks(file, size):
                 if layered:

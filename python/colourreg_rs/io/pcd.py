@@ -17,7 +17,7 @@ import numpy.typing as npt
 from .. import _core
 from ..errors import FileError, InvalidInputError
 from .atomic import open_binary, reason, reopen
-from .clouds import CHUNK_SIZE, AnyArray, Attribute, CloudChunk, CloudReader
+from .clouds import CHUNK_SIZE, PIECE, AnyArray, Attribute, CloudChunk, CloudReader
 
 _TRUNCATED = "the file is truncated: copy it again"
 _ROWS = 65536
@@ -172,7 +172,7 @@ class PcdReader(CloudReader):
         return 8 if self._apart is None else super().rgb_bits()
 
     def chunks(self, size: int = CHUNK_SIZE, positions_only: bool = False) -> Iterator[PcdChunk]:
-        size = max(1, int(size))
+        size = min(max(1, int(size)), PIECE)
         start = 0
         try:
             with reopen(self.path, self._file) as file:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from ..errors import FileError
 from .atomic import open_binary, reason, reopen
-from .clouds import CHUNK_SIZE, AnyArray, Attribute, CloudChunk, CloudReader
+from .clouds import CHUNK_SIZE, PIECE, AnyArray, Attribute, CloudChunk, CloudReader
 from .las_header import take
 from .ply_header import Element, PlyHeader, Property, read_header, row_of_text, skip_element
 
@@ -144,7 +144,7 @@ class PlyReader(CloudReader):
         return 8 if self.colour_scale == 256.0 else 16
 
     def chunks(self, size: int = CHUNK_SIZE, positions_only: bool = False) -> Iterator[PlyChunk]:
-        size = max(1, int(size))
+        size = min(max(1, int(size)), PIECE)
         start = 0
         try:
             with reopen(self.path, self._file) as file:

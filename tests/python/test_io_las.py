@@ -395,7 +395,7 @@ def test_damaged_bytes_never_end_in_anything_but_a_line(data_dir, tmp_path, rng,
     source, target = tmp_path / f"in{Path(name).suffix}", tmp_path / f"out{Path(name).suffix}"
     header = struct.unpack_from("<I", whole, 96)[0]
     refused = 0
-    for i in range(80):
+    for i in range(50):
         data = bytearray(whole)
         end = header + 60 if i % 3 else len(data)
         for at in rng.integers(4, end, rng.integers(1, 4)):

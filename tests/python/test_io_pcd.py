@@ -179,7 +179,7 @@ def test_truncated_files_are_refused_in_one_line(tmp_path, rng, encoding):
     data = whole.read_bytes()
     source, target = tmp_path / "in.pcd", tmp_path / "out" / "out.ply"
     target.parent.mkdir()
-    for cut in range(len(data) - (5 if encoding == "ascii" else 0)):
+    for cut in range(0, len(data) - (5 if encoding == "ascii" else 0), 2):
         source.write_bytes(data[:cut])
         with pytest.raises(FileError) as caught:
             colour(source, target)

@@ -142,7 +142,7 @@ class LasReader(CloudReader):
         elif self.laz.largest <= size and self.laz.table:
             layered = self.laz.scheme.layered
             # Enough blocks to keep all processors busy until the last of them.
-            size = min(size, self.laz.largest * max(8, 4 * (os.cpu_count() or 1)))
+            size = min(size, max(PIECE, self.laz.largest * max(8, 4 * (os.cpu_count() or 1))))
             selection = laz.POSITIONS if positions_only else laz.POSITIONS_AND_COLOUR
             for block in self.laz.blocks(file, size):
                 if layered:

@@ -221,7 +221,8 @@ class Features:
         tuning: str = "cosine4",
     ) -> Features:
         """Oriented gradient channels, of reversed contrast the same. ``tuning`` (``cfog``, ``cosine2``, ``cosine4``) is
-        how likeness falls with the angle. Sigmas in px. Raises DegenerateError for a picture without edges. Source: Ye et
+        how likeness falls with the angle. Sigmas in px. Raises DegenerateError for a picture without edges. Source:
+        Ye et
         al., Fast and robust matching for multimodal remote sensing image registration (CFOG), TGRS 2019."""
 
     @staticmethod
@@ -290,7 +291,8 @@ def information_distance(
 ) -> tuple[float, FloatArray, int]:
     """The normalised information distance between the ranks 0 to 1 of intensities (N,) of visible points (N, 3) and the
     photo, whose size is the view's; its gradient (6,) by rotation vector on the left and projection centre; and how
-    many points lie in the photo. Source: Stewart and Newman, LAPS, ICRA 2012. Raises DegenerateError below 100 points."""
+    many points lie in the photo. Source: Stewart and Newman, LAPS, ICRA 2012. Raises DegenerateError below 100
+    points."""
 
 def rank(values: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     """Ranks of values (N,), 0 to 1; equal values share the middle of theirs."""

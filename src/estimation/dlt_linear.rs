@@ -116,7 +116,7 @@ impl Normalised {
         }
         let svd = a.thin_svd().map_err(|e| Error::Internal(format!("singular values of the DLT: {e:?}")))?;
         let (s, v) = (svd.S().column_vector(), svd.V());
-        if !(s[10] > RANK * s[0]) {
+        if s[10] <= RANK * s[0] || s[10].is_nan() {
             return Err(Error::Degenerate {
                 what: "the control points do not determine a DLT".into(),
                 quantity: "the last but one singular value over the first",

@@ -140,16 +140,21 @@ NEAR = (15.0, 120.0)
 )
 @pytest.mark.parametrize("at", ["origin", "utm"])
 def test_blunders_are_named_and_the_view_is_that_of_the_clean_points(n, blunders, size, at, rng):
+    false_alarms = 0
     for _ in range(40):
         s = scene(rng, n, noise=0.7, shift=UTM if at == "utm" else 0.0)
         bad = spoil(s, rng, blunders, size)
         result = _core.resect_robust(s.view, s.xyz, s.xy)
-        assert np.flatnonzero(~used(result)).tolist() == bad.tolist()
+        rejected = np.flatnonzero(~used(result))
+        assert set(bad) <= set(rejected)
+        false_alarms += len(rejected) > len(bad)
         assert (result.test_ratios[bad] > 1).all() and (result.test_ratios[used(result)] <= 1).all()
         clean = _core.resect(s.view, s.xyz[used(result)], s.xy[used(result)])
         turn, shift = difference(result.view, clean.view)
         assert turn < 1e-10 and shift < 1e-8
         assert result.covariance == pytest.approx(clean.covariance, rel=1e-6, abs=1e-15)
+    # At the level of 0.001 one of 40 loses a good point with a probability of 4 %, two of them with 0.1 %.
+    assert false_alarms <= 1
 
 
 def test_blunders_beside_a_free_camera_are_named(rng):

@@ -695,3 +695,199 @@ def estimate_dlt(
     :meth:`View.dlt`. ``sigma_xy``: pixels, (N, 2) or (N, 2, 2) covariances. ``check``: points that take no part. Raises
     InvalidInputError for too few points or a left-handed frame, DegenerateError for points in one plane or otherwise
     undetermined, NotConvergedError. Source: Abdel-Aziz and Karara 1971; Hartley and Zisserman, chapter 7."""
+
+class Adjustment:
+    """A view from a Gauss-Helmert adjustment, and everything that is said about it. Immutable."""
+
+    @property
+    def view(self) -> View: ...
+    @property
+    def names(self) -> list[str]:
+        """The free parameters' names, in the order of ``values`` and ``covariance``."""
+
+    @property
+    def values(self) -> FloatArray:
+        """(U,); the rotation vector is zero: it is counted from the estimate itself."""
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(U, U), a posteriori: scaled by the variance factor where that is estimated."""
+
+    def dlt_covariance(self) -> tuple[list[str], FloatArray] | None:
+        """Names ``h11`` … ``h34`` (and distortion terms) and their covariance, of the matrix scaled to
+        ‖(h31 h32 h33)‖ = 1, singular in that direction; ``None`` where the parameters are not a DLT's."""
+
+    def statistics(self) -> dict[str, Any]:
+        """For N points given (rejected ones included), U parameters, C = 2 conditions, M = 5 observations
+        (x, y, X, Y, Z):
+
+        ``dof``, ``iterations``, ``omega`` (weighted square sum), ``variance_factor`` and its root ``sigma0`` (``None``
+        without redundancy), ``scale`` (the factor in all covariances), ``scale_dof`` (``None`` where it is not
+        estimated), ``variance_test`` (lower, upper, p, accepted), ``cofactor`` and ``correlations`` (U, U),
+        ``high_correlations`` [(name, name, r)] above 0.95, ``smallest_eigenvalue`` of the scaled normal matrix,
+        ``rejected`` [(point, statistic, critical)], ``critical``, ``noncentrality``, ``group_redundancy``
+        (photo, object, priors), ``variance_components`` (factors, sigmas, correlation) or ``None``;
+        ``used`` (N,), ``residuals`` (N, C) predicted - observed, ``corrections`` (N, M), ``redundancy`` (N, M),
+        ``statistic`` and ``p_value`` (N,) of the test of the whole point, ``deleted`` (N, C) and
+        ``deleted_covariance`` (N, C, C): the residual against the estimate without the point; ``detectable`` (N,) in
+        the worst ``detectable_direction`` (N, C), ``detectable_observation`` (N, M), ``effect_on_parameters`` (N, U),
+        ``effect_on_places`` (N,): the largest shift over the photo, px, by an undetected bias. NaN (effects: infinite)
+        where the other points do not control a point."""
+
+class SimilarityAdjustment:
+    """As :class:`Adjustment`, for a similarity of D dimensions. Its observations are target, then source."""
+
+    @property
+    def similarity(self) -> tuple[float, FloatArray, FloatArray]:
+        """Scale, rotation (D, D), translation (D,): ``target = scale * rotation @ source + translation``."""
+
+    @property
+    def names(self) -> list[str]: ...
+    @property
+    def covariance(self) -> FloatArray:
+        """Of scale, rotation (an angle, or a small vector applied on the left) and translation; a posteriori."""
+
+    def statistics(self) -> dict[str, Any]: ...
+
+def adjust(
+    view: View,
+    xyz: FloatArray,
+    xy: FloatArray,
+    cov_xyz: FloatArray,
+    cov_xy: FloatArray,
+    free: list[str],
+    *,
+    dlt: bool = False,
+    priors: tuple[list[str], list[float], FloatArray] | None = None,
+    constraints: list[tuple[list[tuple[str, float]], float]] = ...,
+    distances: list[tuple[list[float], float]] = ...,
+    alpha: float = 0.001,
+    power: float = 0.80,
+    estimate_variance: bool = True,
+    alpha_variance: float = 0.05,
+    snoop: bool = True,
+    variance_components: bool = False,
+) -> Adjustment:
+    """Adjusts a view, from its present values, to control points: world (N, 3) and pixel (N, 2) coordinates with their
+    covariances (N, 3, 3) and (N, 2, 2).
+
+    ``free``: as the command line's ``--free``; with ``dlt`` the eleven parameters of a matrix and the distortion terms
+    that ``free`` names. ``priors``: names, values and covariance of free parameters (rotation: vector from the start).
+    ``constraints``: [([(name, coefficient), …], value)]; ``distances``: [(point, distance of the projection centre)].
+    Raises InvalidInputError, DegenerateError (naming the parameters), NotConvergedError. Sources: Pope 1972, Baarda
+    1968, Förstner and Wrobel 2016.
+    """
+
+def adjust_similarity(
+    source: FloatArray,
+    target: FloatArray,
+    cov_source: FloatArray,
+    cov_target: FloatArray,
+    *,
+    alpha: float = 0.001,
+    power: float = 0.80,
+    estimate_variance: bool = True,
+    alpha_variance: float = 0.05,
+    snoop: bool = True,
+    variance_components: bool = False,
+) -> SimilarityAdjustment:
+    """The similarity between point pairs (N, D), D = 2 or 3, uncertain in both frames (covariances (N, D, D)). The
+    start is Umeyama's closed form. Raises as :func:`adjust`."""
+
+def scanner_covariance(
+    xyz: FloatArray, station: list[float], sigma_range: float, sigma_horizontal: float, sigma_vertical: float
+) -> FloatArray:
+    """Covariances (N, 3, 3) of points (N, 3) measured from a station: range in metres, angles in radians, +z up."""
+
+def region_limit(probability: float, dimension: int, dof: int | None = None) -> float:
+    """The squared Mahalanobis distance inside which ``dimension`` components lie with this probability: χ², or F times
+    the dimension where the covariance was scaled with a variance factor of ``dof`` degrees of freedom."""
+
+def exceedance(value: float, dimension: int, dof: int | None = None) -> float:
+    """The probability of a larger squared Mahalanobis distance; the inverse of :func:`region_limit`."""
+
+def predict(view: View, names: list[str], covariance: FloatArray, xyz: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Pixels (N, 2) of exact world points and their covariance (N, 2, 2), px², by the view's covariance (any of its
+    parameters' names, or h11 … h34). NaN where not visible."""
+
+def predicted_error_map(
+    view: View, names: list[str], covariance: FloatArray, depth: float, columns: int = 25, rows: int = 19
+) -> dict[str, FloatArray]:
+    """What the view's covariance does over the whole photo at one depth (along the axis; range for fisheye and
+    panorama), on a grid from border to border: ``xy`` (rows, columns, 2), ``xyz``, ``covariance`` (…, 2, 2),
+    ``sigma_px`` (one sigma per axis), ``largest_px`` (longer half-axis), ``sigma_object`` (across the ray, the world's
+    unit), ``sigma_angle`` (radians). NaN where nothing is imaged."""
+
+def check_points(
+    view: View,
+    xyz: FloatArray,
+    xy: FloatArray,
+    cov_xyz: FloatArray,
+    cov_xy: FloatArray,
+    *,
+    names: list[str] | None = None,
+    covariance: FloatArray | None = None,
+    scale: float = 1.0,
+    dof: int | None = None,
+) -> dict[str, Any]:
+    """Points that took no part in the estimate. ``scale`` and ``dof`` are the adjustment's ``scale`` and ``scale_dof``.
+
+    ``residuals`` (N, 2) observed - predicted with ``covariance`` (N, 2, 2), ``offsets`` (N, 3) from the point to the
+    observed ray, ``statistic`` and ``p_value`` (N,), ``joint_statistic`` and ``joint_p_value`` of all together (their
+    common error of the view is taken into account), ``pixels`` and
+    ``object``: rms (per coordinate), rmse (radial), axes."""
+
+def next_points(
+    view: View,
+    names: list[str],
+    covariance: FloatArray,
+    candidates: FloatArray,
+    cov_xyz: FloatArray,
+    cov_xy: FloatArray,
+    targets: FloatArray,
+    *,
+    criterion: str = "mean",
+    count: int = 1,
+) -> dict[str, Any]:
+    """Which of the ``candidates`` (N, 3) would, measured with these covariances, most reduce the predicted error over
+    the ``targets`` (M, 3): its root ``mean`` square, or the ``largest``. One after the other: ``candidate``, ``xy``,
+    ``mean_px`` and ``largest_px`` (before, after); and for each candidate alone ``candidates_mean_px`` and
+    ``candidates_largest_px``, NaN where not in the photo. Source: Fedorov 1972."""
+
+class SurfaceSigma:
+    """The position error of colours on surfaces, for one view: ColourSigma. Immutable."""
+
+    def __init__(
+        self,
+        view: View,
+        names: list[str],
+        covariance: FloatArray,
+        *,
+        sigma_image: float,
+        sigma_xyz: float = 0.0,
+        scanner: tuple[list[float], float, float, float] | None = None,
+    ) -> None:
+        """``sigma_image``: px. The points' own error is ``sigma_xyz`` in every direction (the world's unit), or that of
+        a ``scanner``: station, sigma of range, horizontal and vertical angle (radians)."""
+
+    @property
+    def exact_share(self) -> float:
+        """The share of the photo's table cells in which the formula is evaluated instead of interpolated."""
+
+    def at(self, xyz: FloatArray, *, normals: FloatArray | None = None) -> npt.NDArray[np.float32]:
+        """One sigma per axis on the surface (N,), in the world's unit, √(trace / 2): within 0.4 % of the formula. NaN
+        outside the photo. Normals (N, 3) of any length; without one the surface is taken as facing the camera."""
+
+    def exact(self, xyz: FloatArray, normals: FloatArray | None = None) -> FloatArray:
+        """The formula itself, slowly."""
+
+    def fill_where(
+        self,
+        xyz: FloatArray,
+        source: npt.NDArray[np.uint16],
+        number: int,
+        out: npt.NDArray[np.float32],
+        *,
+        normals: FloatArray | None = None,
+    ) -> None:
+        """As :meth:`at`, into ``out`` (N,), only where ``source`` (N,) is ``number``."""

@@ -19,7 +19,7 @@
 use nalgebra::{DMatrix, DVector, SMatrix, SVector};
 use rayon::prelude::*;
 
-use super::normal_equations::{NormalEquations, Reduced};
+use super::normal_equations::{NormalEquations, Reduced, SINGULAR, TOO_WEAK};
 use crate::error::{Error, Result};
 use crate::estimation::MAX_FREE;
 
@@ -315,7 +315,7 @@ where
     }
     // A problem without a determined answer does not converge either; that is the better thing to say.
     let reduced = Reduced::new(&normal, conditions.constraints(&state).as_ref())?;
-    reduced.refuse_singular(&names)?;
+    reduced.refuse_singular(&names, TOO_WEAK)?;
     Err(Error::NotConverged {
         what: "the adjustment",
         iterations: MAX_ITERATIONS,
@@ -383,7 +383,7 @@ where
         });
     }
     let reduced = Reduced::new(normal, constraints.as_ref())?;
-    reduced.refuse_singular(names)?;
+    reduced.refuse_singular(names, SINGULAR)?;
     let cofactor = reduced.inverse();
     let prior_redundancy = priors
         .as_ref()

@@ -10,6 +10,8 @@ use crate::estimation::MAX_FREE;
 /// Smallest eigenvalue of the scaled normal matrix that is not yet rounding. Its square root is the part of a parameter
 /// that the other parameters cannot imitate.
 pub(super) const SINGULAR: f64 = 1e-12;
+/// The same for an iteration that did not converge: below this, weak determination is why.
+pub(super) const TOO_WEAK: f64 = 1e-6;
 
 /// N = Σ Aᵀ W⁻¹ A, g = Σ Aᵀ W⁻¹ w, and the objective Σ wᵀ W⁻¹ w.
 #[derive(Debug, Clone)]
@@ -146,7 +148,7 @@ impl Reduced {
     }
 
     /// An error that names the parameters which cannot be told apart.
-    pub fn refuse_singular(&self, names: &[String]) -> Result<()> {
+    pub fn refuse_singular(&self, names: &[String], limit: f64) -> Result<()> {
         let (mut place, mut smallest, mut largest) = (0, f64::INFINITY, 0.0f64);
         for (k, e) in self.eigen.eigenvalues.iter().enumerate() {
             largest = largest.max(*e);
@@ -154,7 +156,7 @@ impl Reduced {
                 (place, smallest) = (k, *e);
             }
         }
-        if smallest > SINGULAR * largest {
+        if smallest > limit * largest {
             return Ok(());
         }
         // In scaled units the eigenvector says how much each parameter takes part.
@@ -168,7 +170,7 @@ impl Reduced {
             what: format!("the points do not determine {}", involved.join(", ")),
             quantity: "smallest over largest eigenvalue of the scaled normal matrix",
             value: smallest / largest,
-            limit: SINGULAR,
+            limit,
             remedy: "spread the points over the photo and in depth, add some, or free fewer parameters",
         })
     }

@@ -110,6 +110,50 @@ impl SurfaceSigma {
         });
         Ok(())
     }
+
+    /// As [`SurfaceSigma::fill`], only for the points whose source is `number`: those that this view coloured.
+    pub fn fill_where(
+        &self,
+        xyz: &[[f64; 3]],
+        normals: Option<&[[f64; 3]]>,
+        source: &[u16],
+        number: u16,
+        out: &mut [f32],
+    ) -> Result<()> {
+        if source.len() != xyz.len() || out.len() != xyz.len() || normals.is_some_and(|n| n.len() != xyz.len()) {
+            return Err(Error::invalid(format!(
+                "{} points with {} sources, {} normals and room for {} sigmas",
+                xyz.len(),
+                source.len(),
+                normals.map_or(0, <[_]>::len),
+                out.len()
+            )));
+        }
+        out.par_chunks_mut(BLOCKS * BLOCK).enumerate().for_each(|(task, out)| {
+            let first = task * BLOCKS * BLOCK;
+            let mut mine = [0usize; BLOCK];
+            let (mut points, mut turned, mut found) = ([[0.0; 3]; BLOCK], [[0.0; 3]; BLOCK], [0.0f32; BLOCK]);
+            let mut at = 0;
+            while at < out.len() {
+                let mut n = 0;
+                while n < BLOCK && at < out.len() {
+                    if source[first + at] == number {
+                        (mine[n], points[n]) = (at, xyz[first + at]);
+                        if let Some(normals) = normals {
+                            turned[n] = normals[first + at];
+                        }
+                        n += 1;
+                    }
+                    at += 1;
+                }
+                fill_block(self, &points[..n], normals.map(|_| &turned[..n]), &mut found[..n]);
+                for (place, value) in mine[..n].iter().zip(&found) {
+                    out[*place] = *value;
+                }
+            }
+        });
+        Ok(())
+    }
 }
 
 fn unit_normal(normal: Option<&[f64; 3]>) -> Option<Vector3<f64>> {

@@ -59,6 +59,11 @@ impl<'py, T: Element> Input<'py, T> {
         Ok(self.values()?.as_chunks::<N>().0)
     }
 
+    /// Square matrices, one after the other.
+    pub fn matrices<const N: usize>(&self) -> PyResult<&[[[T; N]; N]]> {
+        Ok(self.rows::<N>()?.as_chunks::<N>().0)
+    }
+
     /// The shape.
     pub fn shape(&self) -> &[usize] {
         self.0.shape()

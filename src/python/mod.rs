@@ -1,8 +1,10 @@
 //! The Python module `colourreg_rs._core`: a list of what it holds. Wrappers only; the work is done in the core.
 
+mod adjustment;
 mod arrays;
 mod codecs;
 mod colour;
+mod colour_sigma;
 mod dlt;
 mod errors;
 mod estimation;
@@ -23,6 +25,8 @@ fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     codecs::register(m)?;
     files::register(m)?;
     geometry::register(m)?;
+    adjustment::register(m)?;
+    colour_sigma::register(m)?;
     render::register(m)?;
     render_sci::register(m)?;
     colour::register(m)?;

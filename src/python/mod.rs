@@ -6,9 +6,12 @@ mod colour;
 mod errors;
 mod files;
 mod geometry;
+mod icp;
 mod matching;
+mod neighbours;
 mod render;
 mod render_sci;
+mod similarity;
 mod simulate;
 
 use pyo3::prelude::*;
@@ -26,5 +29,8 @@ fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     colour::register(m)?;
     simulate::register(m)?;
     matching::register(m)?;
+    icp::register(m)?;
+    neighbours::register(m)?;
+    similarity::register(m)?;
     Ok(())
 }

@@ -2,7 +2,8 @@
 //!
 //! The story, bottom up: [`geometry`] knows poses and cameras and takes points to pixels and back. [`estimation`] finds
 //! views from control points, [`adjustment`] says how sure they are. [`render`] keeps depth buffers and makes surfaces of
-//! them, and the synthetic camera image, which [`matching`] compares with the photo; [`colour`] says which photo sees a
+//! them, and the synthetic camera image, which [`matching`] compares with the photo; [`icp`] brings image points without known pairs together, by their nearest
+//! [`neighbours`]; [`colour`] says which photo sees a
 //! point and what colour it has there. [`records`] and [`lzf`] are the inner loops of reading and writing clouds.
 //! [`simulate`] casts rays into scenes, for data whose truth is known. The core knows neither Python nor files; the
 //! bindings in `python` (feature `python`) wrap it.
@@ -15,8 +16,10 @@ pub mod colour;
 pub mod error;
 pub mod estimation;
 pub mod geometry;
+pub mod icp;
 pub mod lzf;
 pub mod matching;
+pub mod neighbours;
 pub mod records;
 pub mod render;
 pub mod simulate;

@@ -3,6 +3,7 @@
 
 use colourreg::adjustment::*;
 use colourreg::estimation::FreeSet;
+use colourreg::estimation::{SimilarityOptions, fit_similarity};
 use colourreg::geometry::{Camera, Model, Pose, Similarity, View, rotation_exp};
 use colourreg::{Error, Result};
 use nalgebra::{DMatrix, DVector, SMatrix, SVector, Vector3};
@@ -408,7 +409,7 @@ fn similarities_in_both_dimensions() {
         .collect();
     let (cs, ct) = (vec![diagonal::<2>(0.0); 40], vec![diagonal::<2>(0.01); 40]);
     let found = adjust_similarity::<2, 4>(&flat(&noisy), &plane, &cs, &ct, &quiet()).unwrap();
-    let closed = Similarity::fit(&flat(&noisy), &plane).unwrap();
+    let closed = fit_similarity(&flat(&noisy), &plane, &SimilarityOptions::default()).unwrap().similarity();
     assert!((found.similarity.scale - closed.scale).abs() < 1e-12);
     assert!((found.similarity.translation - closed.translation).norm() < 1e-9);
     assert_eq!(found.adjusted.names, ["scale", "angle", "tx", "ty"]);

@@ -7,6 +7,7 @@ use nalgebra::{DMatrix, Matrix3, SMatrix, SVector, Vector3};
 use super::full::{Adjusted, FullOptions, adjust_fully};
 use super::gauss_helmert::{Conditions, Design, Linearised, Observed};
 use crate::error::{Error, Result};
+use crate::estimation::{SimilarityOptions, fit_similarity};
 use crate::geometry::{Similarity, rotation_exp, skew_matrix};
 
 /// Between frames whose origins lie near the points: scale, rotation (an angle, or a small vector applied on the left),
@@ -127,7 +128,7 @@ where
         points.iter().map(|p| std::array::from_fn(|i| p[i] - origin[i])).collect()
     };
     let (near_source, near_target) = (local(source, &from), local(target, &to));
-    let start = Similarity::fit(&near_source, &near_target)?;
+    let start = fit_similarity(&near_source, &near_target, &SimilarityOptions::default())?.similarity();
     let observed: Vec<Observed<M>> = (0..n)
         .map(|i| Observed {
             value: SVector::from_fn(|k, _| if k < D { near_target[i][k] } else { near_source[i][k - D] }),

@@ -18,6 +18,7 @@ mod sampling;
 mod score;
 mod start;
 mod verdict;
+mod similarity;
 
 pub use blunders::Criterion;
 pub use dlt::{Dlt, DltMethod, DltOptions, estimate_dlt};
@@ -31,3 +32,4 @@ pub use resection::{Prior, Resection, ResectionOptions, Start, Status, resect, r
 pub use residuals::Rms;
 pub use sampling::Random;
 pub use verdict::{Verdict, Warning};
+pub use similarity::{SimilarityFit, SimilarityOptions, fit_similarity, iterate_similarity};

@@ -10,9 +10,12 @@ mod errors;
 mod estimation;
 mod files;
 mod geometry;
+mod icp;
 mod matching;
+mod neighbours;
 mod render;
 mod render_sci;
+mod similarity;
 mod simulate;
 
 use pyo3::prelude::*;
@@ -35,5 +38,8 @@ fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     dlt::register(m)?;
     matching::register(m)?;
     estimation::register(m)?;
+    icp::register(m)?;
+    neighbours::register(m)?;
+    similarity::register(m)?;
     Ok(())
 }

@@ -1,0 +1,107 @@
+//! Nearest neighbours.
+
+use numpy::{PyArray1, PyArray2};
+use pyo3::prelude::*;
+use rayon::prelude::*;
+
+use super::arrays::{Input, owned, points2, points3};
+use crate::error::Result;
+use crate::neighbours::{NONE, Neighbour, Neighbours, Within};
+
+enum Index {
+    Plane(Neighbours<2>),
+    Space(Neighbours<3>),
+}
+
+#[pyclass(frozen, name = "Neighbours", module = "colourreg_rs._core")]
+pub(super) struct PyNeighbours(Index);
+
+/// Indices with −1 where there is no neighbour, and distances.
+fn columns(found: &[Neighbour]) -> (Vec<i64>, Vec<f64>) {
+    let one = |n: &Neighbour| (if n.index == NONE { -1 } else { i64::from(n.index) }, n.distance2.sqrt());
+    found.par_iter().with_min_len(8192).map(one).unzip()
+}
+
+/// Runs one of the core's batch searches, whatever the dimension.
+macro_rules! search {
+    ($self:expr, $py:expr, $queries:expr, |$index:ident, $rows:ident| $search:expr) => {
+        match &$self.0 {
+            Index::Plane($index) => {
+                let input = points2($queries, "queries")?;
+                let $rows = input.rows::<2>()?;
+                $py.detach(|| $search)
+            }
+            Index::Space($index) => {
+                let input = points3($queries, "queries")?;
+                let $rows = input.rows::<3>()?;
+                $py.detach(|| $search)
+            }
+        }
+    };
+}
+
+type Rows<'py> = (Bound<'py, PyArray2<i64>>, Bound<'py, PyArray2<f64>>);
+type Lists<'py> = (Bound<'py, PyArray1<i64>>, Bound<'py, PyArray1<i64>>, Bound<'py, PyArray1<f64>>);
+
+#[pymethods]
+impl PyNeighbours {
+    #[new]
+    fn new(py: Python<'_>, points: &Bound<'_, PyAny>) -> PyResult<Self> {
+        let plane: bool = points.getattr("shape").is_ok_and(|s| s.extract::<(usize, usize)>().is_ok_and(|s| s.1 == 2));
+        if plane {
+            let input: Input<'_, f64> = points2(points, "points")?;
+            let rows = input.rows::<2>()?;
+            return Ok(Self(Index::Plane(py.detach(|| Neighbours::new(rows))?)));
+        }
+        let input = points3(points, "points")?;
+        let rows = input.rows::<3>()?;
+        Ok(Self(Index::Space(py.detach(|| Neighbours::new(rows))?)))
+    }
+
+    fn __len__(&self) -> usize {
+        match &self.0 {
+            Index::Plane(index) => index.len(),
+            Index::Space(index) => index.len(),
+        }
+    }
+
+    #[pyo3(signature = (queries, max_distance=f64::INFINITY))]
+    fn nearest<'py>(
+        &self,
+        py: Python<'py>,
+        queries: &Bound<'py, PyAny>,
+        max_distance: f64,
+    ) -> PyResult<(Bound<'py, PyArray1<i64>>, Bound<'py, PyArray1<f64>>)> {
+        let (index, distance) = search!(self, py, queries, |index, rows| {
+            index.nearest(rows, max_distance).map(|found| columns(&found))
+        })?;
+        Ok((PyArray1::from_vec(py, index), PyArray1::from_vec(py, distance)))
+    }
+
+    #[pyo3(signature = (queries, k, max_distance=f64::INFINITY))]
+    fn k_nearest<'py>(
+        &self,
+        py: Python<'py>,
+        queries: &Bound<'py, PyAny>,
+        k: usize,
+        max_distance: f64,
+    ) -> PyResult<Rows<'py>> {
+        let (index, distance) = search!(self, py, queries, |index, rows| {
+            index.k_nearest(rows, k, max_distance).map(|found| columns(&found))
+        })?;
+        let n = index.len() / k;
+        Ok((owned(py, index, [n, k])?, owned(py, distance, [n, k])?))
+    }
+
+    fn within<'py>(&self, py: Python<'py>, queries: &Bound<'py, PyAny>, max_distance: f64) -> PyResult<Lists<'py>> {
+        let found: Result<Within> = search!(self, py, queries, |index, rows| index.within(rows, max_distance));
+        let Within { offsets, neighbours } = found?;
+        let (index, distance) = columns(&neighbours);
+        let offsets = offsets.into_iter().map(|o| o as i64).collect();
+        Ok((PyArray1::from_vec(py, offsets), PyArray1::from_vec(py, index), PyArray1::from_vec(py, distance)))
+    }
+}
+
+pub(super) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
+    m.add_class::<PyNeighbours>()
+}

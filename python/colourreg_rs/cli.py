@@ -85,6 +85,68 @@ def demo(
 
 
 @app.command()
+def simulate(
+    scene: Annotated[str, typer.Argument(help="corner, demo, facade, room, square or trial.")],
+    out: Annotated[Path, typer.Option(help="Folder for scan, photos and truth.")],
+    seed: Annotated[int, typer.Option(help="Another scene for another number.", min=0)] = 0,
+    photos: Annotated[int | None, typer.Option(help="How many photos.")] = None,
+    size: Annotated[str | None, typer.Option(help="Width and height of the photos: 2400x1600.")] = None,
+    camera: Annotated[
+        str, typer.Option(help="PINHOLE, OPENCV, FULL_OPENCV, OPENCV_FISHEYE or EQUIRECTANGULAR.")
+    ] = "OPENCV",
+    points: Annotated[int | None, typer.Option(help="Directions that the scanner measures.")] = None,
+    rotation: Annotated[
+        str, typer.Option(help="The true view against the approximate one: degrees, one or three numbers (X,Y,Z).")
+    ] = "0.5",
+    translation: Annotated[str, typer.Option(help="The same in metres.")] = "0.02",
+    principal_point: Annotated[str, typer.Option(help="Its offset in pixels: DX,DY.")] = "0,0",
+    focal: Annotated[float, typer.Option(help="Error of the focal length, as a share of it.")] = 0.0,
+    distortion: Annotated[str, typer.Option(help="Errors of distortion terms: k1=-0.02,p2=0.001.")] = "",
+    pixel_noise: Annotated[
+        float | None, typer.Option(help="Sigma of pixel noise in grey values; 0 also switches JPEG off.")
+    ] = None,
+    point_noise: Annotated[float, typer.Option(help="Sigma of control points in the photo, pixels.")] = 0.3,
+    point_noise_3d: Annotated[float, typer.Option(help="Sigma of control points in space, metres.")] = 0.002,
+    blunders: Annotated[float, typer.Option(help="Share of the control points that are blunders.")] = 0.0,
+    control_points: Annotated[int, typer.Option(help="How many control points.", min=0)] = 12,
+    check_points: Annotated[int, typer.Option(help="How many check points.", min=0)] = 6,
+    no_scan_noise: Annotated[bool, typer.Option("--no-scan-noise", help="Perfect ranges and angles.")] = False,
+    offset: Annotated[str, typer.Option(help="Where the scene lies in the world: E,N,H in metres.")] = "0,0,0",
+    yaw: Annotated[float, typer.Option(help="How it is turned there, degrees.")] = 0.0,
+    json_file: JsonOption = None,
+) -> None:
+    """A scan and photos whose truth is known, with errors put in by hand."""
+    from .simulate import simulate_from_text
+
+    with terminal_bars() as progress:
+        files, description = simulate_from_text(
+            scene,
+            out,
+            seed=seed,
+            photos=photos,
+            size=size,
+            camera=camera,
+            points=points,
+            rotation=rotation,
+            translation=translation,
+            principal_point=principal_point,
+            focal=focal,
+            distortion=distortion,
+            pixel_noise=pixel_noise,
+            point_noise=(point_noise, point_noise_3d),
+            blunders=blunders,
+            control=(control_points, check_points),
+            scan_noise=not no_scan_noise,
+            offset=offset,
+            yaw=yaw,
+            progress=progress,
+        )
+    print(f"{scene}, seed {seed}: {description['points']:,} points, {len(description['photos'])} photos")
+    print("\n".join(f"  {path}" for path in files))
+    _write_json(json_file, description)
+
+
+@app.command()
 def info(
     files: Annotated[
         list[Path], typer.Argument(metavar="FILE...", help="Clouds, photos, registrations, cameras, points.")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -135,3 +137,47 @@ def test_what_is_written_can_be_read_and_projects_rightly(tmp_path: Path) -> Non
     assert truth.image.is_file()
     what = json.loads((tmp_path / "out" / "simulation.json").read_text())
     assert what["photos"][0]["translation"] == pytest.approx((truth.pose.centre - start.pose.centre).tolist(), abs=1e-6)
+
+
+def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "colourreg_rs.cli", "simulate", *arguments], capture_output=True, text=True, check=False
+    )
+
+
+def test_the_command_puts_in_the_errors_that_it_is_told(tmp_path: Path) -> None:
+    out = tmp_path / "sim"
+    options = "--size 160x120 --points 4000 --rotation 1,-2,0.5 --translation 0.1,0,0 --principal-point 4,-3"
+    more = "--distortion k1=-0.01 --blunders 0.25 --offset 5e5,5e6,100 --yaw 30 --pixel-noise 0"
+    done = run("trial", "--out", str(out), "--seed", "3", *options.split(), *more.split())
+    assert done.returncode == 0, done.stderr
+    start, truth = (read_registration(out / n).views[0] for n in ("start.json", "truth.json"))
+    assert truth.camera.params["cx"] - start.camera.params["cx"] == pytest.approx(4.0)
+    assert truth.camera.params["k1"] - start.camera.params["k1"] == pytest.approx(-0.01)
+    moved = np.linalg.norm(truth.pose.centre - start.pose.centre)
+    assert moved == pytest.approx(0.1, abs=1e-6)
+    assert truth.pose.centre[1] > 4.9e6
+    assert (out / "photo-1.png").is_file()
+    what = json.loads((out / "simulation.json").read_text())
+    np.testing.assert_allclose(np.degrees(what["photos"][0]["rotation"]), [1, -2, 0.5], atol=1e-6)
+    control = [p for p in truth.points if p.role == "control"]
+    assert len(what["photos"][0]["blunders"]) == round(0.25 * len(control)) > 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("moon",), "no scene 'moon'"),
+        (("trial", "--size", "10"), "--size '10' is not 2 finite numbers"),
+        (("trial", "--rotation", "1,2"), "--rotation '1,2' is not 1 or 3 finite numbers"),
+        (("trial", "--distortion", "k1"), "'k1' is not NAME=VALUE"),
+        (("trial", "--camera", "BOX"), "--camera 'BOX' is not one of PINHOLE"),
+        (("trial", "--blunders", "7"), "--blunders 7.0 is not a share"),
+    ],
+)
+def test_wrong_options_are_refused_in_one_line(arguments: tuple[str, ...], said: str, tmp_path: Path) -> None:
+    done = run(*arguments, "--out", str(tmp_path / "x"))
+    assert done.returncode == 1
+    assert said in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "x").exists()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from .disturbance import Disturbance
+from .options import simulate_from_text
 from .photo import Response, SimulatedPhoto
 from .scanner import Scanner, ScanTruth
 from .scene import Frame, Hits, Scene
@@ -22,5 +23,6 @@ __all__ = [
     "SimulatedPhoto",
     "Simulation",
     "simulate",
+    "simulate_from_text",
     "write_simulation",
 ]

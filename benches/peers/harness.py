@@ -28,7 +28,10 @@ class Figure:
 
 def run_once(function: Callable[..., float], arguments: Sequence[str]) -> tuple[float, float]:
     """Seconds that the function returns, and the peak memory of its process in MB."""
-    command = [sys.executable, "-m", "benches.peers.harness", function.__module__, function.__name__, *arguments]
+    module = function.__module__
+    if module == "__main__":  # the comparison itself is what was started
+        module = str(getattr(sys.modules[module].__spec__, "name", module))
+    command = [sys.executable, "-m", "benches.peers.harness", module, function.__name__, *arguments]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     output = process.stdout.read()

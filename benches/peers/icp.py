@@ -1,6 +1,7 @@
 """How fast is 2D ICP of 100,000 points against 100,000, against small_gicp and NumPy + SciPy?
 
-All programs get the same points and threshold, do the same number of iterations (small_gicp is asked for 30 and may stop
+All programs get the same points and threshold, do the same number of iterations
+(small_gicp is asked for 30 and may stop
 before, where the error no longer falls), run in the same process with both cores, and must agree on the transformation.
 small_gicp works in space: its points have z = 0. Wall-clock time and processor time: on a machine that does other
 things the latter is the fairer one. Limits: a rigid motion, point to point, a fixed threshold; small_gicp's time does
@@ -129,7 +130,7 @@ def main() -> None:
                 cpu[name].append(time.process_time() - begin_cpu)
         print(f"2D ICP, {args.points:,} to {args.points:,} points ({kind.__name__}), {iterations} iterations")
         for name in programs:
-            a, b = ([source @ h[:2, :2].T + h[:2, 2] for h in (answers["colourreg"], answers[name])])
+            a, b = [source @ h[:2, :2].T + h[:2, 2] for h in (answers["colourreg"], answers[name])]
             t, p = float(np.median(wall[name])), float(np.median(cpu[name]))
             t0, p0 = float(np.median(wall["colourreg"])), float(np.median(cpu["colourreg"]))
             print(

@@ -16,9 +16,9 @@ mod resection;
 mod residuals;
 mod sampling;
 mod score;
+mod similarity;
 mod start;
 mod verdict;
-mod similarity;
 
 pub use blunders::Criterion;
 pub use dlt::{Dlt, DltMethod, DltOptions, estimate_dlt};
@@ -31,5 +31,5 @@ pub use ransac::RansacOptions;
 pub use resection::{Prior, Resection, ResectionOptions, Start, Status, resect, resect_robust};
 pub use residuals::Rms;
 pub use sampling::Random;
-pub use verdict::{Verdict, Warning};
 pub use similarity::{SimilarityFit, SimilarityOptions, fit_similarity, iterate_similarity};
+pub use verdict::{Verdict, Warning};

@@ -195,6 +195,29 @@ def test_every_point_format(tmp_path, rng, form, suffix):
         assert reader.header.point_format in RGB_OFFSET
 
 
+@pytest.mark.parametrize("form", range(11))
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_laszip_reads_what_is_compressed_here(tmp_path, rng, form, suffix):
+    pytest.importorskip("laszip", reason="the reference codec is not installed: pip install laszip")
+    source, target = tmp_path / f"in{suffix}", tmp_path / "out.laz"
+    make(source, form, rng, n=52_000)
+    given = colour(source, target, rng)
+    old, new = laspy.read(source), laspy.read(target, laz_backend=laspy.LazBackend.Laszip)
+    assert np.array_equal(new.green, given["rgb"][:, 1]) and np.array_equal(new["ColourSigma"], given["sigma"])
+    for name in old.points.array.dtype.names:
+        if name not in ("red", "green", "blue"):
+            assert old.points.array[name].tobytes() == new.points.array[name].tobytes(), name
+
+
+@pytest.mark.parametrize("form", [4, 5])
+def test_waveform_packets_have_the_version_that_all_programs_know(tmp_path, rng, form):
+    source, target = tmp_path / "in.laz", tmp_path / "out.laz"
+    make(source, form, rng, n=10)
+    colour(source, target, rng)
+    with open_cloud(target) as reader:
+        assert {item.kind: item.version for item in reader.laz.scheme.items}[9] == 1
+
+
 @pytest.mark.parametrize("form", [6, 7, 8, 9, 10])
 @pytest.mark.parametrize("channels", [1, 3])
 def test_streams_of_compressed_blocks_are_exchanged(tmp_path, rng, form, channels):

@@ -14,7 +14,7 @@ import io
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -28,7 +28,7 @@ from .las_header import LasHeader, Record
 Bytes = npt.NDArray[np.uint8]
 
 USER, NUMBER = "laszip encoded", 22204
-POINT14, RGB14, RGBNIR14, WAVE14, BYTE14 = 10, 11, 12, 13, 14
+WAVE13, POINT14, RGB14, RGBNIR14, WAVE14, BYTE14 = 9, 10, 11, 12, 13, 14
 POSITIONS = int(lazrs.SELECTIVE_DECOMPRESS_XY_RETURNS_CHANNEL | lazrs.SELECTIVE_DECOMPRESS_Z)
 POSITIONS_AND_COLOUR = POSITIONS | int(lazrs.SELECTIVE_DECOMPRESS_RGB)
 EVERYTHING = int(lazrs.SELECTIVE_DECOMPRESS_ALL)
@@ -99,7 +99,10 @@ class Scheme:
     def for_points(cls, point_format: int, extra_bytes: int) -> Scheme:
         """The scheme that new files are written with."""
         data = bytes(lazrs.LazVlr.new_for_compression(point_format, extra_bytes).record_data())
-        return cls._of(data)
+        scheme = cls._of(data)
+        # lazrs calls its waveform packets of formats 4 and 5 version 2, which LASzip does not know; they are version 1.
+        items = tuple(replace(item, version=1) if item.kind == WAVE13 else item for item in scheme.items)
+        return scheme.with_items(items)
 
     @classmethod
     def _of(cls, data: bytes) -> Scheme:
@@ -130,7 +133,7 @@ class Scheme:
 
 
 #: Bytes of the items whose size is fixed.
-_SIZES = {6: 20, 7: 8, 8: 6, 9: 29, POINT14: 30, RGB14: 6, RGBNIR14: 8, WAVE14: 29}
+_SIZES = {6: 20, 7: 8, 8: 6, WAVE13: 29, POINT14: 30, RGB14: 6, RGBNIR14: 8, WAVE14: 29}
 
 
 @contextmanager

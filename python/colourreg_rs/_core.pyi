@@ -4,7 +4,7 @@ Frames: *world* is the cloud's frame; the *camera* frame is x right, y down, z f
 the top-left pixel. Angles are radians. A wrong dtype raises ``TypeError``, a wrong shape ``ValueError``.
 """
 
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -905,9 +905,7 @@ class Neighbours:
     def __len__(self) -> int:
         """How many points there are."""
 
-    def nearest(
-        self, queries: FloatArray, max_distance: float = ...
-    ) -> tuple[npt.NDArray[np.int64], FloatArray]:
+    def nearest(self, queries: FloatArray, max_distance: float = ...) -> tuple[npt.NDArray[np.int64], FloatArray]:
         """The nearest point of each query (M, 2 or 3) within a distance, which by default is infinite: indices (M,), −1
         where there is none, and distances (M,), infinite where there is none."""
 
@@ -924,7 +922,7 @@ class Neighbours:
         query ``i`` are ``offsets[i]:offsets[i + 1]``."""
 
 class SimilarityFit:
-    """A similarity transformation ``target = scale * rotation @ source + translation`` and how well it is determined."""
+    """A similarity transformation, ``target = scale * rotation @ source + translation``, and how sure it is."""
 
     @property
     def scale(self) -> float: ...
@@ -979,9 +977,9 @@ def fit_similarity(
     """The least-squares similarity between pairs (N, 2) or (N, 3), in closed form, or iterated from ``initial`` (scale,
     rotation, translation).
 
-    ``weights`` (N,) are 1/σ² of a target coordinate; a weight of 0 leaves a pair out. ``fixed_scale`` holds the scale at
-    1, or at its initial value. Raises DegenerateError for too few pairs, for points in one place and, in space, for
-    points on one line; NotConvergedError where the initial values are too far off. Source: Umeyama 1991.
+    ``weights`` (N,) are 1/σ² of a target coordinate; a weight of 0 leaves a pair out. ``fixed_scale`` holds the scale
+    at 1, or at its initial value. Raises DegenerateError for too few pairs, for points in one place and, in space,
+    for points on one line; NotConvergedError where the initial values are too far off. Source: Umeyama 1991.
     """
 
 class IcpResult:
@@ -1060,7 +1058,7 @@ def icp(
     source_covariance: FloatArray | None = None,
     target_covariance: FloatArray | None = None,
     gate_probability: float = 0.99,
-    neighbours: int = 10,
+    neighbours: int = 16,
     max_iterations: int = 100,
     change_tolerance: float = 1e-4,
     residual_limit: float = 1.0,
@@ -1082,4 +1080,60 @@ def icp(
 
     Raises DegenerateError when fewer than ``min_pairs`` pairs are left. Sources: Besl and McKay 1992; Chen and Medioni
     1992; Zhang 1994; Chetverikov et al. 2002.
+    """
+
+def backproject(view: View, xy: FloatArray, depth: FloatArray) -> FloatArray:
+    """Pixels (N, 2) with depths (N,), as the view has them, to world points (N, 3); distortion is removed first. NaN
+    where the lens images nothing and where the depth is not positive. Raises InvalidInputError."""
+
+def invert_dlt(P: FloatArray, xy: FloatArray, depth: FloatArray, *, pseudo_inverse: bool = False) -> FloatArray:
+    """Pixels (N, 2) of a DLT matrix (3, 4) of any scale, with depths (N,) in metres, to world points (N, 3).
+
+    With the third row scaled to be metric, ``X = M⁻¹ (s x̃ − p₄)``; with ``pseudo_inverse`` the same points as ``P⁺ x̃
+    + λ C̃``, λ fixed by the depth (which loses digits far from the origin). Raises DegenerateError for a camera at
+    infinity. Source: Hartley and Zisserman, Multiple View Geometry, 6.2.2.
+    """
+
+@overload
+def backproject_pixels(
+    view: View,
+    depth: npt.NDArray[np.float32] | FloatArray,
+    measured: npt.NDArray[np.bool_],
+    xy: FloatArray,
+    *,
+    subpixel: npt.NDArray[np.float32] | None = None,
+    radius: float = 4.0,
+    extension: float = 0.0,
+    max_incidence: float = ...,
+    depth_sigma: float = 0.003,
+    pixel_sigma: float = 0.5,
+    placement_sigma: float = ...,
+) -> tuple[FloatArray, FloatArray, npt.NDArray[np.uint8], FloatArray]: ...
+@overload
+def backproject_pixels(
+    view: View,
+    depth: npt.NDArray[np.float32] | FloatArray,
+    measured: npt.NDArray[np.bool_],
+    xy: None = None,
+    *,
+    subpixel: npt.NDArray[np.float32] | None = None,
+    radius: float = 4.0,
+    extension: float = 0.0,
+    max_incidence: float = ...,
+    depth_sigma: float = 0.003,
+    pixel_sigma: float = 0.5,
+    placement_sigma: float = ...,
+) -> tuple[npt.NDArray[np.int64], FloatArray, FloatArray, npt.NDArray[np.uint8], FloatArray]:
+    """World points behind pixels, with depths from a synthetic camera image of the same view.
+
+    ``depth`` (H, W), float32 or float64, counts where ``measured`` (H, W); ``subpixel`` (H, W, 2) is the measured
+    points' true place from their pixels' centres. For pixels ``xy`` (N, 2): points (N, 3), depths (N,), origins
+    (N,) of the depth (0 none, 1 measured, 2 interpolated within one surface, 3 extended along one beside the cloud)
+    and sigmas (N, 2) along the ray and, per axis, across it, in metres. Without ``xy``: of all pixels' centres that
+    have a depth, and first their numbers (row * W + column).
+
+    A surface is a plane through measured points within ``radius`` px; it is extended up to ``extension`` px, and not
+    used at an incidence beyond ``max_incidence`` (radians, by default 85 degrees). No depth is made across a depth
+    edge. ``depth_sigma`` (m), ``pixel_sigma`` (px, of the photo's place) and ``placement_sigma`` (px, of points in
+    their pixels without ``subpixel``) are propagated. Raises InvalidInputError.
     """

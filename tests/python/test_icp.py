@@ -71,9 +71,9 @@ def test_without_noise_it_returns_the_truth(motion, metric, rng):
 @pytest.mark.parametrize("metric", ["point", "line"])
 def test_the_basin_holds_a_fifth_of_the_spacing_of_windows(metric, rng):
     """20 px where windows are about 125 px apart; beyond it, wrong ends are never accepted."""
-    for offset, wanted in [(5, 8), (20, 6), (80, 0), (200, 0)]:
+    for offset, wanted in [(5, 4), (20, 3), (120, 0)]:
         right = 0
-        for _ in range(8):
+        for _ in range(4):
             direction = rng.random() * 2 * np.pi
             shift = offset * np.cos(direction), offset * np.sin(direction)
             truth = similarity(1 + rng.normal(0, 0.003), rng.normal(0, 0.005), *shift)
@@ -91,7 +91,7 @@ def test_a_wrong_shift_ends_in_a_wrong_scale_and_is_recognised(rng):
     segments = facade(rng)
     source = sample(rng, segments)
     recognised = []
-    for direction in np.linspace(0, 2 * np.pi, 12, endpoint=False):
+    for direction in np.linspace(0, 2 * np.pi, 6, endpoint=False):
         truth = similarity(1, 0, 400 * np.cos(direction), 400 * np.sin(direction))
         target = apply(truth, sample(rng, segments))
         result = _core.icp(source, target, motion="affine", residual_limit=30.0)
@@ -125,7 +125,9 @@ def test_mahalanobis_gates_and_weighs(rng):
     truth = similarity(1.002, 0.003, 2, -1)
     base = scattered(rng, 600)
     angles = rng.random(600) * np.pi
-    axes = np.stack([np.column_stack([np.cos(angles), np.sin(angles)]), np.column_stack([-np.sin(angles), np.cos(angles)])], 1)
+    axes = np.stack(
+        [np.column_stack([np.cos(angles), np.sin(angles)]), np.column_stack([-np.sin(angles), np.cos(angles)])], 1
+    )
     covariance = np.einsum("nki,k,nkj->nij", axes, [9.0, 0.01], axes)
     noise = np.einsum("nki,nk->ni", axes, rng.normal(0, 1, (600, 2)) * [3.0, 0.1])
     source = base + noise
@@ -140,7 +142,7 @@ def test_mahalanobis_gates_and_weighs(rng):
 
 def test_a_slide_along_lines_is_named_with_its_direction(rng):
     lines = np.array([[[0, 100 * k], [900, 100 * k + 300]] for k in range(4)], float)
-    source, target = sample(rng, lines, keep=1.1), sample(rng, lines, keep=1.1) + [3.0, -2.0]
+    source, target = sample(rng, lines, keep=1.1), sample(rng, lines, keep=1.1) + np.array([3.0, -2.0])
     for metric in ("point", "line"):
         result = _core.icp(source, target, motion="rigid", metric=metric, threshold=20.0)
         assert not result.accepted
@@ -178,7 +180,7 @@ def test_reasons_are_told(rng):
     assert _core.icp(source, target + 15.0, max_iterations=2).reason == "iteration limit"
     with pytest.raises(DegenerateError, match="iteration 1: .* number of pairs"):
         _core.icp(source, target + 5000.0, threshold=10.0)
-    with pytest.raises(InvalidInputError, match="no motion 'quadratic'"):
+    with pytest.raises(InvalidInputError, match='no motion "quadratic"'):
         _core.icp(source, target, motion="quadratic")
     with pytest.raises(InvalidInputError, match="no metric"):
         _core.icp(source, target, metric="plane")

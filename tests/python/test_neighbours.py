@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -48,7 +50,7 @@ def test_neighbours_agree_with_scipy(make, d, rng):
     assert all(len(set(row)) == 7 for row in index.tolist())
     offsets, index, distance = ours.within(queries[:500], reach)
     expected = theirs.query_ball_point(queries[:500], reach * (1 + 1e-14))
-    assert [sorted(index[a:b]) for a, b in zip(offsets, offsets[1:], strict=False)] == [sorted(e) for e in expected]
+    assert [sorted(index[a:b]) for a, b in pairwise(offsets)] == [sorted(e) for e in expected]
     assert (distance <= reach * (1 + 1e-12)).all()
 
 

@@ -94,7 +94,7 @@ def test_utm_coordinates_lose_nothing(rng):
 
 
 def test_what_is_not_determined_is_refused(rng):
-    line = np.outer(np.arange(8.0), [1.0, 2.0, 3.0]) + [4.5e5, 5.8e6, 1e2]
+    line = np.outer(np.arange(8.0), [1.0, 2.0, 3.0]) + np.array([4.5e5, 5.8e6, 1e2])
     with pytest.raises(DegenerateError, match=r"one line \(collinear\).*limit is 1\.000e-4"):
         _core.fit_similarity(line, line)
     with pytest.raises(DegenerateError, match="coincide"):

@@ -12,6 +12,7 @@
 //! object space is float64 in the cloud's own frame and unit; angles are radians.
 
 pub mod adjustment;
+pub mod backproject;
 pub mod colour;
 pub mod error;
 pub mod estimation;

@@ -2,8 +2,7 @@
 #![allow(clippy::unwrap_used, missing_docs, reason = "a test")]
 
 use colourreg::adjustment::*;
-use colourreg::estimation::FreeSet;
-use colourreg::estimation::{SimilarityOptions, fit_similarity};
+use colourreg::estimation::{FreeSet, SimilarityOptions, fit_similarity};
 use colourreg::geometry::{Camera, Model, Pose, Similarity, View, rotation_exp};
 use colourreg::{Error, Result};
 use nalgebra::{DMatrix, DVector, SMatrix, SVector, Vector3};

@@ -4,7 +4,7 @@ Frames: *world* is the cloud's frame; the *camera* frame is x right, y down, z f
 the top-left pixel. Angles are radians. A wrong dtype raises ``TypeError``, a wrong shape ``ValueError``.
 """
 
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -891,3 +891,249 @@ class SurfaceSigma:
         normals: FloatArray | None = None,
     ) -> None:
         """As :meth:`at`, into ``out`` (N,), only where ``source`` (N,) is ``number``."""
+
+class Neighbours:
+    """Points of the plane or of space, ready to be searched for the nearest ones. Immutable; batches run in parallel.
+
+    The plane is searched by a grid of cells, clustered points and space by a kd-tree; both are exact. Between points at
+    the same distance one is taken, always the same.
+    """
+
+    def __init__(self, points: FloatArray) -> None:
+        """From points (N, 2) or (N, 3). Raises InvalidInputError for no point, and for a point that is not finite."""
+
+    def __len__(self) -> int:
+        """How many points there are."""
+
+    def nearest(self, queries: FloatArray, max_distance: float = ...) -> tuple[npt.NDArray[np.int64], FloatArray]:
+        """The nearest point of each query (M, 2 or 3) within a distance, which by default is infinite: indices (M,), −1
+        where there is none, and distances (M,), infinite where there is none."""
+
+    def k_nearest(
+        self, queries: FloatArray, k: int, max_distance: float = ...
+    ) -> tuple[npt.NDArray[np.int64], FloatArray]:
+        """The ``k`` nearest points of each query within a distance, nearest first: indices (M, k), filled up with −1,
+        and distances (M, k), filled up with infinity."""
+
+    def within(
+        self, queries: FloatArray, max_distance: float
+    ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], FloatArray]:
+        """All points within a distance of each query, nearest first: offsets (M + 1,), indices and distances; those of
+        query ``i`` are ``offsets[i]:offsets[i + 1]``."""
+
+class SimilarityFit:
+    """A similarity transformation, ``target = scale * rotation @ source + translation``, and how sure it is."""
+
+    @property
+    def scale(self) -> float: ...
+    @property
+    def rotation(self) -> FloatArray:
+        """(2, 2) or (3, 3)."""
+
+    @property
+    def translation(self) -> FloatArray: ...
+    @property
+    def centre_source(self) -> FloatArray:
+        """The weighted centroid of the source points."""
+
+    @property
+    def centre_target(self) -> FloatArray:
+        """Where the centroid goes: the shift whose covariance is given."""
+
+    @property
+    def residuals(self) -> FloatArray:
+        """Target minus transformed source, (N, 2 or 3)."""
+
+    @property
+    def sigma0(self) -> float:
+        """A posteriori standard deviation of unit weight; NaN without redundancy."""
+
+    @property
+    def dof(self) -> int: ...
+    @property
+    def covariance(self) -> FloatArray:
+        """A posteriori, of the scale (unless fixed), the rotation (an angle, or a small rotation vector on the left, in
+        radians) and ``centre_target``."""
+
+    @property
+    def iterations(self) -> int:
+        """0 for the closed form."""
+
+    @property
+    def mirrored(self) -> bool:
+        """A mirror image would fit at least twice as well: one frame has a reversed axis."""
+
+    def apply(self, points: FloatArray) -> FloatArray:
+        """Source points (N, 2 or 3) to the target frame, without loss at large coordinates."""
+
+def fit_similarity(
+    source: FloatArray,
+    target: FloatArray,
+    *,
+    weights: FloatArray | None = None,
+    fixed_scale: bool = False,
+    initial: tuple[float, FloatArray, FloatArray] | None = None,
+) -> SimilarityFit:
+    """The least-squares similarity between pairs (N, 2) or (N, 3), in closed form, or iterated from ``initial`` (scale,
+    rotation, translation).
+
+    ``weights`` (N,) are 1/σ² of a target coordinate; a weight of 0 leaves a pair out. ``fixed_scale`` holds the scale
+    at 1, or at its initial value. Raises DegenerateError for too few pairs, for points in one place and, in space,
+    for points on one line; NotConvergedError where the initial values are too far off. Source: Umeyama 1991.
+    """
+
+class IcpResult:
+    """What an iteration of closest points ended with. Check ``accepted``: it always ends somewhere."""
+
+    @property
+    def transform(self) -> FloatArray:
+        """(3, 3), homogeneous, from source to target, last element 1."""
+
+    @property
+    def names(self) -> list[str]:
+        """Of the parameters: of tx, ty, rotation (radians), scale; of affine and projective ones h11 … h32."""
+
+    @property
+    def parameters(self) -> FloatArray: ...
+    @property
+    def covariance(self) -> FloatArray:
+        """Of the parameters, a posteriori. Where the target's points lie in a line, they count across it alone."""
+
+    @property
+    def pairs(self) -> npt.NDArray[np.int64]:
+        """Source and target index of each pair of the last iteration, (P, 2)."""
+
+    @property
+    def residuals(self) -> FloatArray:
+        """Target minus transformed source, (P, 2)."""
+
+    @property
+    def rms(self) -> float:
+        """Per coordinate: √(Σ(vx² + vy²) / 2P)."""
+
+    @property
+    def rmse(self) -> float:
+        """Radial: √(Σ(vx² + vy²) / P)."""
+
+    @property
+    def sigma0(self) -> float:
+        """A posteriori standard deviation of unit weight: of a coordinate, unless covariances were given."""
+
+    @property
+    def distinctness(self) -> float:
+        """Of how much better the source matches here than shifted aside, of how much better it could: 0 to 1."""
+
+    @property
+    def history(self) -> list[tuple[float, int, float, float]]:
+        """Of each iteration: threshold, number of pairs, root mean square residual, largest shift of a corner."""
+
+    @property
+    def reason(self) -> str:
+        """Why it ended: ``converged``, ``residuals large`` or ``iteration limit``."""
+
+    @property
+    def accepted(self) -> bool:
+        """Whether it converged and nothing speaks against the result."""
+
+    @property
+    def findings(self) -> list[tuple[str, str, float, float]]:
+        """What speaks against it: kind, sentence, figure, limit. Kinds: ``not converged``, ``ambiguous``, ``few
+        paired``, ``many to one``, ``not distinct``, ``scale``, ``mirrored``."""
+
+    def covariance_at(self, source: FloatArray) -> FloatArray:
+        """Covariance (N, 2, 2) of where source points (N, 2) go, by the covariance of the transformation."""
+
+def icp(
+    source: FloatArray,
+    target: FloatArray,
+    *,
+    motion: str = "similarity",
+    metric: str = "point",
+    initial: FloatArray | None = None,
+    threshold: float | None = None,
+    final_threshold: float | None = None,
+    reduction: float = 0.8,
+    mutual: bool = False,
+    keep: float = 1.0,
+    source_covariance: FloatArray | None = None,
+    target_covariance: FloatArray | None = None,
+    gate_probability: float = 0.99,
+    neighbours: int = 16,
+    max_iterations: int = 100,
+    change_tolerance: float = 1e-4,
+    residual_limit: float = 1.0,
+    min_pairs: int = 10,
+    scale_limit: float = 1.5,
+    min_share: float = 0.25,
+) -> IcpResult:
+    """The transformation from points (N, 2) to points (M, 2) whose pairs are not known; lengths in pixels.
+
+    Closest points within a threshold → least-squares transformation → apply → smaller threshold, until the change *and*
+    the residuals are small. ``motion``: translation, rigid, similarity, affine, projective. ``metric``: ``point``, or
+    ``line`` for the distance from the line through ``neighbours`` of the target's points (of the points where these lie
+    in no line). ``initial`` (3, 3) is approximate. The threshold starts at twice the distance that 90 % of the first
+    pairs keep, is multiplied by ``reduction`` after each iteration, and ends at three robust sigmas of the residuals.
+    ``mutual`` keeps pairs that are the closest both ways, ``keep`` a part of them, the closest. Covariances (N, 2, 2)
+    gate pairs by their Mahalanobis distance at ``gate_probability``, and weigh them. ``change_tolerance`` is of the
+    source's corners, ``residual_limit`` of the root mean square. ``scale_limit`` and ``min_share`` (of source points
+    that find a partner) are what a result may have without a finding.
+
+    Raises DegenerateError when fewer than ``min_pairs`` pairs are left. Sources: Besl and McKay 1992; Chen and Medioni
+    1992; Zhang 1994; Chetverikov et al. 2002.
+    """
+
+def backproject(view: View, xy: FloatArray, depth: FloatArray) -> FloatArray:
+    """Pixels (N, 2) with depths (N,), as the view has them, to world points (N, 3); distortion is removed first. NaN
+    where the lens images nothing and where the depth is not positive. Raises InvalidInputError."""
+
+def invert_dlt(P: FloatArray, xy: FloatArray, depth: FloatArray, *, pseudo_inverse: bool = False) -> FloatArray:
+    """Pixels (N, 2) of a DLT matrix (3, 4) of any scale, with depths (N,) in metres, to world points (N, 3).
+
+    With the third row scaled to be metric, ``X = M⁻¹ (s x̃ − p₄)``; with ``pseudo_inverse`` the same points as ``P⁺ x̃
+    + λ C̃``, λ fixed by the depth (which loses digits far from the origin). Raises DegenerateError for a camera at
+    infinity. Source: Hartley and Zisserman, Multiple View Geometry, 6.2.2.
+    """
+
+@overload
+def backproject_pixels(
+    view: View,
+    depth: npt.NDArray[np.float32] | FloatArray,
+    measured: npt.NDArray[np.bool_],
+    xy: FloatArray,
+    *,
+    subpixel: npt.NDArray[np.float32] | None = None,
+    radius: float = 4.0,
+    extension: float = 0.0,
+    max_incidence: float = ...,
+    depth_sigma: float = 0.003,
+    pixel_sigma: float = 0.5,
+    placement_sigma: float = ...,
+) -> tuple[FloatArray, FloatArray, npt.NDArray[np.uint8], FloatArray]: ...
+@overload
+def backproject_pixels(
+    view: View,
+    depth: npt.NDArray[np.float32] | FloatArray,
+    measured: npt.NDArray[np.bool_],
+    xy: None = None,
+    *,
+    subpixel: npt.NDArray[np.float32] | None = None,
+    radius: float = 4.0,
+    extension: float = 0.0,
+    max_incidence: float = ...,
+    depth_sigma: float = 0.003,
+    pixel_sigma: float = 0.5,
+    placement_sigma: float = ...,
+) -> tuple[npt.NDArray[np.int64], FloatArray, FloatArray, npt.NDArray[np.uint8], FloatArray]:
+    """World points behind pixels, with depths from a synthetic camera image of the same view.
+
+    ``depth`` (H, W), float32 or float64, counts where ``measured`` (H, W); ``subpixel`` (H, W, 2) is the measured
+    points' true place from their pixels' centres. For pixels ``xy`` (N, 2): points (N, 3), depths (N,), origins
+    (N,) of the depth (0 none, 1 measured, 2 interpolated within one surface, 3 extended along one beside the cloud)
+    and sigmas (N, 2) along the ray and, per axis, across it, in metres. Without ``xy``: of all pixels' centres that
+    have a depth, and first their numbers (row * W + column).
+
+    A surface is a plane through measured points within ``radius`` px; it is extended up to ``extension`` px, and not
+    used at an incidence beyond ``max_incidence`` (radians, by default 85 degrees). No depth is made across a depth
+    edge. ``depth_sigma`` (m), ``pixel_sigma`` (px, of the photo's place) and ``placement_sigma`` (px, of points in
+    their pixels without ``subpixel``) are propagated. Raises InvalidInputError.
+    """

@@ -266,6 +266,29 @@ def evaluate(
     _write_json(json_file, [e.as_dict() for e in result])
 
 
+@app.command()
+def backproject(
+    cloud: Annotated[Path, typer.Argument(help="The laser scan.")],
+    registration: Annotated[Path, typer.Argument(metavar="REG.json", help="The registration of its photos.")],
+    out: Annotated[Path, typer.Option(help="The cloud of the photos' pixels: .las, .laz or .ply.")],
+    extension: Annotated[
+        float, typer.Option(help="How far surfaces are extended beside the cloud, pixels.", min=0.0)
+    ] = 0.0,
+    depth_sigma: Annotated[float, typer.Option(help="Noise of the scanner along the ray, metres.", min=0.0)] = 0.003,
+    pixel_sigma: Annotated[
+        float, typer.Option(help="Sigma of a pixel's place by registration and photo.", min=0.0)
+    ] = 0.5,
+    json_file: JsonOption = None,
+) -> None:
+    """3D points, with colour, for the pixels of photos: measured, interpolated within one surface, or extended."""
+    from .backproject import BackprojectOptions, backproject_file
+
+    options = BackprojectOptions(extension=extension, depth_sigma=depth_sigma, pixel_sigma=pixel_sigma)
+    result = backproject_file(cloud, registration, out, options=options)
+    print(result.text())
+    _write_json(json_file, result.as_dict())
+
+
 for _command, _american in ((colourise, "colorize"),):
     app.command(_american, hidden=True)(_command)
 

@@ -15,7 +15,7 @@ use crate::neighbours::{NONE, Neighbour, Neighbours};
 const CANDIDATES: usize = 4;
 
 /// Variance across over variance along a neighbourhood: below the first it is a line, above the second it is none.
-const LINE: [f64; 2] = [0.02, 0.1];
+const LINE: [f64; 2] = [0.05, 0.25];
 
 /// The direction of a point's neighbourhood.
 #[derive(Debug, Clone, Copy)]

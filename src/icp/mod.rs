@@ -96,7 +96,7 @@ impl Default for Options {
             mutual: false,
             keep: 1.0,
             gate_probability: 0.99,
-            neighbours: 10,
+            neighbours: 16,
             max_iterations: 100,
             change_tolerance: 1e-4,
             residual_limit: 1.0,

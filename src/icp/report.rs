@@ -12,7 +12,7 @@ use super::matching::{Matcher, Pairs, Residuals};
 use crate::error::Result;
 
 /// The smallest over the largest eigenvalue of the information about the parameters, below which they are ambiguous.
-const AMBIGUOUS: f64 = 1e-3;
+const AMBIGUOUS: f64 = 3e-3;
 /// The part of the source that matches at its place and not beside it.
 const DISTINCT: f64 = 0.3;
 /// Different target points over pairs.

@@ -70,6 +70,11 @@ impl<'py, T: Element> Input<'py, T> {
     }
 }
 
+/// Whether an argument is an array of this dtype, where two are possible.
+pub(super) fn holds<T: Element>(array: &Bound<'_, PyAny>) -> bool {
+    array.cast::<PyUntypedArray>().is_ok_and(|a| a.dtype().is_equiv_to(&dtype::<T>(array.py())))
+}
+
 /// (N, 3) float64.
 pub(super) fn points3<'py>(array: &Bound<'py, PyAny>, name: &str) -> PyResult<Input<'py, f64>> {
     Input::new(array, name, &[None, Some(3)])

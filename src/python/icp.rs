@@ -110,7 +110,7 @@ fn as_matrices<'a>(input: Option<&'a Input<'_, f64>>) -> PyResult<Option<&'a [[[
 #[pyo3(signature = (
     source, target, *, motion="similarity", metric="point", initial=None, threshold=None, final_threshold=None,
     reduction=0.8, mutual=false, keep=1.0, source_covariance=None, target_covariance=None, gate_probability=0.99,
-    neighbours=10, max_iterations=100, change_tolerance=1e-4, residual_limit=1.0, min_pairs=10, scale_limit=1.5,
+    neighbours=16, max_iterations=100, change_tolerance=1e-4, residual_limit=1.0, min_pairs=10, scale_limit=1.5,
     min_share=0.25
 ))]
 #[allow(clippy::too_many_arguments, reason = "Python's keywords are Rust's options")]

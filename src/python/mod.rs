@@ -2,6 +2,7 @@
 
 mod adjustment;
 mod arrays;
+mod backproject;
 mod codecs;
 mod colour;
 mod colour_sigma;
@@ -28,6 +29,7 @@ fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     codecs::register(m)?;
     files::register(m)?;
     geometry::register(m)?;
+    backproject::register(m)?;
     adjustment::register(m)?;
     colour_sigma::register(m)?;
     render::register(m)?;

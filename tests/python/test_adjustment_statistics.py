@@ -177,8 +177,10 @@ def test_p_values_of_check_points_are_uniform(rng):
 
 
 def test_variance_components_are_right_on_average(rng):
-    # Points at very different depths: near ones show the object's noise, far ones the photo's.
-    problem = case(60, rng, depths=(2.0, 60.0))
+    # Near points show the object's noise, far ones the photo's.
+    near, far = case(40, rng, depths=(1.5, 3.0)), case(40, rng, depths=(30.0, 60.0))
+    xyz, xy = np.vstack([near.xyz, far.xyz]), np.vstack([near.xy, far.xy])
+    problem = Case(near.view, xyz, xy, near.sigma_xy, near.sigma_xyz)
     true_sigmas = 2 * problem.sigma_xy, 0.5 * problem.sigma_xyz
     simulated = Case(problem.view, problem.xyz, problem.xy, *true_sigmas)
     found, sigmas = [], []

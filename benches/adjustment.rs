@@ -88,7 +88,7 @@ fn colour_sigma(c: &mut Criterion) {
         let free = FreeSet::parse(Model::OpenCv, names).unwrap();
         let covariance = adjusted(&view, 25, &free, &FullOptions::default()).covariance().unwrap();
         let new = || SurfaceSigma::new(&view, &covariance, 0.3, ObjectNoise::Isotropic(0.002)).unwrap();
-        group.bench_function(format!("tables, {} parameters", free.len()), |b| b.iter(new));
+        group.bench_function(format!("tables, {} parameters", free.len()), |b| b.iter(|| new().exact_share()));
         let sigma = new();
         group.bench_function(format!("10 M points, no normals, {} parameters", free.len()), |b| {
             b.iter(|| sigma.fill(&xyz, None, &mut out).unwrap());

@@ -27,12 +27,18 @@ from .progress import Progress, silent
 
 @dataclass(frozen=True)
 class ColouriseOptions:
-    """How a cloud is coloured; the defaults are meant to be right."""
+    """How a cloud is coloured; the defaults are meant to be right.
+
+    ``sigma_image`` (pixels, where a colour is taken) and ``sigma_xyz`` (the cloud's own noise, its unit) go into
+    ColourSigma beside the view's covariance. Points whose ColourSigma exceeds ``max_sigma`` stay uncoloured.
+    """
 
     blend: Literal["best", "mean", "median"] = "best"
     sampling: Literal["bilinear", "bicubic"] = "bilinear"
     max_distance: float | None = None
     max_sigma: float | None = None
+    sigma_image: float = 0.3
+    sigma_xyz: float = 0.002
     level_exposure: bool = False
     chunk_size: int = 1_000_000
 
@@ -120,6 +126,7 @@ class Colouriser:
         self._maps: list[_core.VisibilityMap] = []
         self._exposure = _core.Exposure(len(self.views)) if self.levels else None
         self._gains: FloatArray | None = None
+        self._sigmas = [_surface_sigma(view, self.options) for view in self.views]
 
     @property
     def levels(self) -> bool:
@@ -149,7 +156,23 @@ class Colouriser:
         rgb, source = _core.colour_points(
             self._maps, self._photos, xyz, sampling=options.sampling, blend=options.blend, gains=self._gains
         )
-        return ColouredChunk(rgb, source, np.full(len(xyz), np.nan, np.float32))
+        sigma = np.full(len(xyz), np.nan, np.float32)
+        for number, surface in enumerate(self._sigmas, 1):
+            if surface is not None:
+                surface.fill_where(xyz, source, number, sigma)
+        if options.max_sigma is not None:
+            unsure = sigma > options.max_sigma  # not where it is unknown: NaN compares false
+            source[unsure], sigma[unsure] = 0, np.nan
+        return ColouredChunk(rgb, source, sigma)
+
+
+def _surface_sigma(view: View, options: ColouriseOptions) -> _core.SurfaceSigma | None:
+    """What says how sure the places of this view's colours are; ``None`` where the view's covariance is not known."""
+    if view.covariance is None:
+        return None
+    names, matrix = list(view.covariance.parameters), view.covariance.matrix
+    noise = {"sigma_image": options.sigma_image, "sigma_xyz": options.sigma_xyz}
+    return _core.SurfaceSigma(view.core, names, matrix, **noise)
 
 
 def load_views(paths: Sequence[Path]) -> tuple[list[View], list[Photo]]:

@@ -11,6 +11,8 @@
 //! [`SurfaceSigma::exact`] is that formula; [`SurfaceSigma::fill`] is fast enough for every point of a cloud and agrees
 //! with it to [`TOLERANCE`](super::sigma_tables::TOLERANCE).
 
+use std::sync::OnceLock;
+
 use nalgebra::{Matrix2, Matrix2x3, Matrix3, Vector3};
 use rayon::prelude::*;
 
@@ -43,7 +45,8 @@ pub struct SurfaceSigma {
     pub(super) covariance: ViewCovariance,
     pub(super) image_variance: f64,
     pub(super) object: ObjectNoise,
-    pub(super) faces: Vec<Face>,
+    /// Made when many points are first asked for: the formula alone needs none.
+    faces: OnceLock<Vec<Face>>,
 }
 
 impl SurfaceSigma {
@@ -56,8 +59,17 @@ impl SurfaceSigma {
             }
         }
         let image_variance = sigma_image * sigma_image;
-        let faces = make_faces(view, covariance, image_variance);
-        Ok(Self { view: *view, covariance: covariance.clone(), image_variance, object, faces })
+        Ok(Self { view: *view, covariance: covariance.clone(), image_variance, object, faces: OnceLock::new() })
+    }
+
+    /// The tables. Made without holding the lock: their making is parallel, and a worker that steals a task which asks
+    /// for them again would wait for itself. Two that come at once make the same tables; one is kept.
+    fn faces(&self) -> &[Face] {
+        if let Some(faces) = self.faces.get() {
+            return faces;
+        }
+        let made = make_faces(&self.view, &self.covariance, self.image_variance);
+        self.faces.get_or_init(|| made)
     }
 
     /// One sigma per axis on the surface, in the world's unit; NaN where the view does not see the point. A normal
@@ -85,7 +97,7 @@ impl SurfaceSigma {
 
     /// The share of the photo's table cells that use the exact formula.
     pub fn exact_share(&self) -> f64 {
-        let count = |kind: Cell| self.faces.iter().map(|f| f.count(kind)).sum::<usize>() as f64;
+        let count = |kind: Cell| self.faces().iter().map(|f| f.count(kind)).sum::<usize>() as f64;
         let exact = count(Cell::Exact);
         exact / (exact + count(Cell::Interpolated)).max(1.0)
     }
@@ -100,12 +112,13 @@ impl SurfaceSigma {
                 out.len()
             )));
         }
+        let faces = self.faces();
         out.par_chunks_mut(BLOCKS * BLOCK).enumerate().for_each(|(task, out)| {
             let mut first = task * BLOCKS * BLOCK;
             for out in out.chunks_mut(BLOCK) {
                 let here = first..first + out.len();
                 first = here.end;
-                fill_block(self, &xyz[here.clone()], normals.map(|n| &n[here]), out);
+                fill_block(self, faces, &xyz[here.clone()], normals.map(|n| &n[here]), out);
             }
         });
         Ok(())
@@ -129,6 +142,7 @@ impl SurfaceSigma {
                 out.len()
             )));
         }
+        let faces = self.faces();
         out.par_chunks_mut(BLOCKS * BLOCK).enumerate().for_each(|(task, out)| {
             let first = task * BLOCKS * BLOCK;
             let mut mine = [0usize; BLOCK];
@@ -146,7 +160,7 @@ impl SurfaceSigma {
                     }
                     at += 1;
                 }
-                fill_block(self, &points[..n], normals.map(|_| &turned[..n]), &mut found[..n]);
+                fill_block(self, faces, &points[..n], normals.map(|_| &turned[..n]), &mut found[..n]);
                 for (place, value) in mine[..n].iter().zip(&found) {
                     out[*place] = *value;
                 }

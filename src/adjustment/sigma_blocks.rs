@@ -20,24 +20,42 @@ struct Station {
 }
 
 /// One sigma per axis on the surface for up to [`BLOCK`] points.
-pub(super) fn fill_block(sigma: &SurfaceSigma, xyz: &[[f64; 3]], normals: Option<&[[f64; 3]]>, out: &mut [f32]) {
+pub(super) fn fill_block(
+    sigma: &SurfaceSigma,
+    faces: &[Face],
+    xyz: &[[f64; 3]],
+    normals: Option<&[[f64; 3]]>,
+    out: &mut [f32],
+) {
     #[cfg(target_arch = "x86_64")]
     if std::arch::is_x86_feature_detected!("avx2") {
         // SAFETY: the processor has the instructions that the function is compiled for.
-        unsafe { fill_block_avx2(sigma, xyz, normals, out) };
+        unsafe { fill_block_avx2(sigma, faces, xyz, normals, out) };
         return;
     }
-    fill_block_anywhere(sigma, xyz, normals, out);
+    fill_block_anywhere(sigma, faces, xyz, normals, out);
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
-fn fill_block_avx2(sigma: &SurfaceSigma, xyz: &[[f64; 3]], normals: Option<&[[f64; 3]]>, out: &mut [f32]) {
-    fill_block_anywhere(sigma, xyz, normals, out);
+fn fill_block_avx2(
+    sigma: &SurfaceSigma,
+    faces: &[Face],
+    xyz: &[[f64; 3]],
+    normals: Option<&[[f64; 3]]>,
+    out: &mut [f32],
+) {
+    fill_block_anywhere(sigma, faces, xyz, normals, out);
 }
 
 #[inline(always)]
-fn fill_block_anywhere(sigma: &SurfaceSigma, xyz: &[[f64; 3]], normals: Option<&[[f64; 3]]>, out: &mut [f32]) {
+fn fill_block_anywhere(
+    sigma: &SurfaceSigma,
+    faces: &[Face],
+    xyz: &[[f64; 3]],
+    normals: Option<&[[f64; 3]]>,
+    out: &mut [f32],
+) {
     let n = xyz.len().min(out.len()).min(BLOCK);
     let pose = &sigma.view.pose;
     let rotation: [[f32; 3]; 3] = std::array::from_fn(|i| std::array::from_fn(|k| pose.rotation[(i, k)] as f32));
@@ -84,7 +102,7 @@ fn fill_block_anywhere(sigma: &SurfaceSigma, xyz: &[[f64; 3]], normals: Option<&
 
     // Onto the faces: axes are renamed so that the third is the depth.
     let mut face = [0u8; BLOCK];
-    if sigma.faces.len() > 1 {
+    if faces.len() > 1 {
         for i in 0..n {
             let size = [ray[0][i].abs(), ray[1][i].abs(), ray[2][i].abs()];
             let k = if size[0] >= size[1] && size[0] >= size[2] {
@@ -96,7 +114,7 @@ fn fill_block_anywhere(sigma: &SurfaceSigma, xyz: &[[f64; 3]], normals: Option<&
             };
             let negative = ray[k][i] < 0.0;
             face[i] = (2 * k + usize::from(negative)) as u8;
-            let table = &sigma.faces[usize::from(face[i])];
+            let table = &faces[usize::from(face[i])];
             for lanes in [&mut ray, &mut normal, &mut beam, &mut up] {
                 let q = table.axes.map(|a| lanes[a][i]);
                 (lanes[0][i], lanes[1][i], lanes[2][i]) = (q[0], q[1], table.sign * q[2]);
@@ -113,9 +131,9 @@ fn fill_block_anywhere(sigma: &SurfaceSigma, xyz: &[[f64; 3]], normals: Option<&
     }
 
     // The view's part: places on the tables, then the tables' cells, then the parabola in 1/Z.
-    let Some(only) = sigma.faces.first() else { return out[..n].fill(f32::NAN) };
-    let table = |i: usize| sigma.faces.get(usize::from(face[i])).unwrap_or(only);
-    let several = sigma.faces.len() > 1;
+    let Some(only) = faces.first() else { return out[..n].fill(f32::NAN) };
+    let table = |i: usize| faces.get(usize::from(face[i])).unwrap_or(only);
+    let several = faces.len() > 1;
     let mut places = Places::new();
     for i in 0..BLOCK {
         places.locate(i, if several { table(i) } else { only }, u[i], v[i], w[i]);

@@ -31,7 +31,8 @@ class Correspondences:
     - ``xyz`` (N, 3): points of the cloud; ``xy`` (N, 2): where they are in the photo, px of the full photo.
     - ``covariance`` (N, 2, 2): of ``xy``, px², as the peak and the relief of the template have it.
     - ``template`` (N,): the number of the template; several rows of one are its several hypotheses.
-    - ``score`` and ``here`` (N,): the likeness at the match, and without any shift.
+    - ``score`` (N,): the likeness at the match. ``here`` (T,): that of every known template without any shift, matched or
+      not.
     - ``outcomes``: how many templates ended how.
     """
 
@@ -154,7 +155,7 @@ def find_correspondences(
             covariance=full,
             template=template,
             score=found["score"][matched].astype(np.float64),
-            here=found["here"][matched].astype(np.float64),
+            here=found["here"][np.isfinite(found["here"])].astype(np.float64),
             templates=len(points),
             outcomes={name: int(n) for name, n in zip(_core.MATCH_OUTCOMES, counts, strict=True)},
             pixel=0.5 * (sx + sy),

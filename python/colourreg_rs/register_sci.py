@@ -123,7 +123,9 @@ def register_sci(
     """
     options = options or SciOptions()
     if view.camera is None or view.pose is None:
-        raise InvalidInputError(f"view {view.name!r}: registration by SCI starts from a camera and a pose, not from a DLT")
+        raise InvalidInputError(
+            f"view {view.name!r}: registration by SCI starts from a camera and a pose, not from a DLT"
+        )
     if photo.ndim not in (2, 3) or photo.shape[:2] != (view.camera.height, view.camera.width):
         raise InvalidInputError(
             f"the photo of {photo.shape[1] if photo.ndim > 1 else 0} x {photo.shape[0]} pixels is not that of the camera, "
@@ -308,9 +310,7 @@ class _Loop:
         used = weights > 0
         if used.sum() < 20:
             reasons.append(f"only {int(used.sum())} matches agree with the view; 20 are needed")
-        covariance = match_covariance(
-            view, self.names, found.xyz, found.xy, found.covariance * UNIT**2, found.pixel
-        )
+        covariance = match_covariance(view, self.names, found.xyz, found.xy, found.covariance * UNIT**2, found.pixel)
         predicted = float("nan")
         if covariance is None:
             reasons.append("the matches do not determine the view")
@@ -385,7 +385,7 @@ class _Loop:
                 )
             except DegenerateError:
                 return (float("inf"), 0.0)
-            likeness.append(found.here[np.isfinite(found.here)])
+            likeness.append(found.here)
         a, b = likeness
         if len(a) < 10 or len(b) < 10:
             return (float("inf") if len(b) > len(a) else float("-inf"), 0.0)

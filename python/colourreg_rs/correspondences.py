@@ -1,7 +1,7 @@
 """Correspondences between a cloud and a photo, without picking: SCI, interest points, templates, and 3D by the index.
 
-A template of the SCI is found in the photo by its oriented gradients. The point behind it is the one that the index image
-names, at its own place in its pixel: the shift is that of the template, the pixel that of the point.
+A template of the SCI is found in the photo by its oriented gradients. The point behind it is the one that the index
+image names, at its own place in its pixel: the shift is that of the template, the pixel that of the point.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from .sci import LUMINANCE, SCI, points_of, render_sci, with_size
 #: No match is more precise than this, px of the level: what is left of the SCI's own grid.
 FLOOR = 0.05
 
-#: How far an edge that relief makes in one picture alone lies from the surface's own: as far as the relief is deep, seen
-#: from the camera, times this. Found on simulated façades.
+#: How far an edge that relief makes in one picture alone lies from the surface's own: as far as the relief is deep,
+#: seen from the camera, times this. Found on simulated façades.
 RELIEF = 1.0
 
 
@@ -31,8 +31,8 @@ class Correspondences:
     - ``xyz`` (N, 3): points of the cloud; ``xy`` (N, 2): where they are in the photo, px of the full photo.
     - ``covariance`` (N, 2, 2): of ``xy``, px², as the peak and the relief of the template have it.
     - ``template`` (N,): the number of the template; several rows of one are its several hypotheses.
-    - ``score`` (N,): the likeness at the match. ``here`` (T,): that of every known template without any shift, matched or
-      not.
+    - ``score`` (N,): the likeness at the match. ``here`` (T,): that of every known template without any shift,
+      matched or not.
     - ``outcomes``: how many templates ended how.
     """
 

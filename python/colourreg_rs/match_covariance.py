@@ -1,7 +1,8 @@
 """The covariance of a view estimated from matches that are not independent.
 
 Neighbouring templates overlap and see the same sill, shadow and SCI; all of them share what the SCI gets wrong
-everywhere. Taken as independent, a thousand matches promise a tenth of the error that they leave. So, after the robust fit:
+everywhere. Taken as independent, a thousand matches promise a tenth of the error that they leave. So, after the robust
+fit:
 
 - the sandwich ``H⁻¹ G H⁻¹``, whose filling ``G`` sums the products of the matches' gradients *with those of their
   neighbours*, weighted by a Gaussian of their distance in the photo (Conley 1999), and is raised for the number of

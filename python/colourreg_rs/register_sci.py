@@ -1,9 +1,10 @@
 """From an approximate view to a registration, without picking: the loop of SCI, matching and resection.
 
-The SCI is rendered at the current view and matched with the photo; each match gives a point of the cloud and its place in
-the photo; a robust resection gives the next view; and the SCI is rendered again, until the view stands still. Coarse to
-fine: at the coarsest level templates span many degrees and are searched over the whole of the start's uncertainty; the
-finest level is the one that the cloud's density supports. The single pass of Forkuo and King is one turn of it.
+The SCI is rendered at the current view and matched with the photo; each match gives a point of the cloud and its place
+in the photo; a robust resection gives the next view; and the SCI is rendered again, until the view stands still.
+Coarse to fine: at the coarsest level templates span many degrees and are searched over the whole of the start's
+uncertainty; the finest level is the one that the cloud's density supports. The single pass of Forkuo and King is one
+turn of it.
 
 A result is believed only if templates that are searched far beyond their own noise come back to where they were
 (``confirmed``); one that is not is returned as a failure, with the figures that say so.
@@ -19,8 +20,14 @@ import numpy as np
 import numpy.typing as npt
 
 from . import _core
-from .correspondences import Correspondences, PhotoPyramid, Search, find_correspondences, pixels_per_radian
-from .correspondences import supported_scale
+from .correspondences import (
+    Correspondences,
+    PhotoPyramid,
+    Search,
+    find_correspondences,
+    pixels_per_radian,
+    supported_scale,
+)
 from .errors import DegenerateError, InvalidInputError, NotConvergedError
 from .match_covariance import design, match_covariance, tukey_weights
 from .model import Covariance, FloatArray, PointCloud, Pose, View
@@ -43,7 +50,7 @@ class SciOptions:
 
     - ``free``: what is estimated; camera parameters only at the finest level.
     - ``search``: how far off the start may be, radians, position and rotation together as seen in the photo.
-    - ``shift``: how far off the start's projection centre may be, metres, one sigma; it only steadies the coarse levels.
+    - ``shift``: how far off the start's projection centre may be, metres, one sigma; for the coarse levels only.
     - ``priors``: (name, value, sigma) of parameters known before, as in resection; they hold at every level.
     - ``tolerance``: the loop ends when the view moves less than this anywhere in the photo, px.
     - ``passes``: at most this many turns at the finest level; 1 with ``single`` is the single pass of the literature.
@@ -63,8 +70,8 @@ class SciOptions:
 
 @dataclass(frozen=True)
 class Turn:
-    """One turn of the loop: at ``scale`` of the photo, ``templates`` were searched, ``matched`` found, ``used`` agreed with
-    the new view, which ``moved`` this far at most anywhere in the photo, px."""
+    """One turn of the loop: at ``scale`` of the photo, ``templates`` were searched, ``matched`` found, ``used`` agreed
+    with the new view, which ``moved`` this far at most anywhere in the photo, px."""
 
     scale: float
     templates: int
@@ -106,7 +113,7 @@ class SciRegistration:
         return int((self.weights > 0).sum())
 
 
-class _Failure(Exception):
+class _LoopError(Exception):
     """The loop cannot go on; the message says why."""
 
 
@@ -118,8 +125,8 @@ def register_sci(
 ) -> SciRegistration:
     """Refines an approximate view of a photo (H, W) or (H, W, 3) against a cloud with intensity or colour.
 
-    A start that is farther off than ``options.search`` is not found, and said so: then ``trusted`` is false and the view
-    is the start. Raises InvalidInputError where photo, camera and cloud do not fit each other.
+    A start that is farther off than ``options.search`` is not found, and said so: then ``trusted`` is false and the
+    view is the start. Raises InvalidInputError where photo, camera and cloud do not fit each other.
     """
     options = options or SciOptions()
     if view.camera is None or view.pose is None:
@@ -128,8 +135,8 @@ def register_sci(
         )
     if photo.ndim not in (2, 3) or photo.shape[:2] != (view.camera.height, view.camera.width):
         raise InvalidInputError(
-            f"the photo of {photo.shape[1] if photo.ndim > 1 else 0} x {photo.shape[0]} pixels is not that of the camera, "
-            f"{view.camera.width} x {view.camera.height}"
+            f"the photo of {photo.shape[1] if photo.ndim > 1 else 0} x {photo.shape[0]} pixels is not that of the "
+            f"camera, {view.camera.width} x {view.camera.height}"
         )
     whole = cloud if isinstance(cloud, PointCloud) else _joined(cloud)
     return _Loop(whole, PhotoPyramid.of(photo), view, options).run()
@@ -162,7 +169,7 @@ class _Loop:
     def run(self) -> SciRegistration:
         try:
             view = self._iterate()
-        except _Failure as failure:
+        except _LoopError as failure:
             return self._failed(str(failure))
         except (DegenerateError, NotConvergedError) as error:
             return self._failed(str(error))
@@ -173,7 +180,7 @@ class _Loop:
     def _scales(self) -> list[float]:
         supported = supported_scale(self.cloud, self.start)
         if supported == 0.0:
-            raise _Failure("no point of the cloud lies in the photo at the start")
+            raise _LoopError("no point of the cloud lies in the photo at the start")
         finest = min(1.0, OVERSAMPLING * supported)
         scales = [finest]
         while not self.options.single and scales[0] * self.long_side > 1.5 * COARSEST:
@@ -217,7 +224,7 @@ class _Loop:
             self.witnesses = self._spread_points(sci)
         if len(found) < 12:
             counts = ", ".join(f"{n} {name}" for name, n in found.outcomes.items() if n)
-            raise _Failure(
+            raise _LoopError(
                 f"only {len(found)} of {found.templates} templates were found in the photo at "
                 f"{scale:.3f} of its size ({counts or 'no interest points'}); at least 12 are needed"
             )
@@ -226,7 +233,7 @@ class _Loop:
     def _spread_points(self, sci: SCI) -> FloatArray:
         rows, columns = np.nonzero(sci.measured)
         if len(rows) == 0:
-            raise _Failure("no point of the cloud lies in the photo at the start")
+            raise _LoopError("no point of the cloud lies in the photo at the start")
         step = max(len(rows) // 2000, 1)
         return np.ascontiguousarray(self.cloud.xyz[sci.index[rows[::step], columns[::step]]])
 

@@ -65,8 +65,8 @@ def test_unusable_input_is_refused():
 
 @pytest.mark.slow
 def test_the_covariance_meets_the_scatter_of_correlated_matches(rng):
-    """Match errors as a smooth random field over the photo: the stated covariance holds the scatter, where one that takes
-    the matches as independent is far too small."""
+    """Match errors as a smooth random field over the photo: the stated covariance holds the scatter, where one that
+    takes the matches as independent is far too small."""
     camera = Camera("PINHOLE", 1500, 1000, {"fx": 1300.0, "fy": 1300.0, "cx": 749.5, "cy": 499.5})
     view = View("v", None, camera, Pose(np.eye(3), np.zeros(3)))
     n, sigma, length = 600, 0.4, 0.05 * 1500

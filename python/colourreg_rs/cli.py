@@ -30,6 +30,7 @@ class Method(StrEnum):
 
     dlt = "dlt"
     resection = "resection"
+    sci = "sci"
 
 
 class Blend(StrEnum):
@@ -161,6 +162,39 @@ def info(
         print(f"{path}:")
         print("\n".join(f"  {line}" for line in lines(description)))
     _write_json(json_file, described)
+
+
+@app.command()
+def sci(
+    cloud: Annotated[Path, typer.Argument(help="The laser scan.")],
+    view: Annotated[Path, typer.Option(help="A registration with the view to render (JSON).")],
+    out: Annotated[Path, typer.Option(help="Folder for the pictures.")],
+    bits: Annotated[int, typer.Option(help="Of the intensity picture: 8 or 16.")] = 8,
+    fill: Annotated[int, typer.Option(help="The widest hole to be filled, pixels; 0 fills none.")] = 8,
+    json_file: JsonOption = None,
+) -> None:
+    """Renders the synthetic camera image of a view: intensity, depth and point index."""
+    from .io.clouds import read_cloud
+    from .io.registration import read_registration
+    from .io.sci import write_sci
+    from .register import with_photo_sizes
+    from .sci import render_sci
+
+    registration = with_photo_sizes(read_registration(view), view)
+    points = read_cloud(cloud)
+    result = []
+    for one in registration.views:
+        folder = out if len(registration.views) == 1 else out / one.name
+        image = render_sci(points, one, bits=16 if bits == 16 else 8 if bits == 8 else bits, fill=fill)  # type: ignore[arg-type]
+        write_sci(folder, image)
+        measured, seen = float(image.measured.mean()), float(image.seen.mean())
+        by_range, by_incidence = image.exponents
+        print(
+            f"{one.name}: {100 * measured:.1f} % of the pixels measured, {100 * (seen - measured):.1f} % filled; "
+            f"intensity freed of range^{by_range:.2f} and cos^{by_incidence:.2f}; wrote {folder}"
+        )
+        result.append({"view": one.name, "folder": str(folder), "measured": measured, "filled": seen - measured})
+    _write_json(json_file, result)
 
 
 @app.command()

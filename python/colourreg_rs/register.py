@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from . import _core
-from .errors import DegenerateError, FileError, InvalidInputError
+from .errors import DegenerateError, FileError, InvalidInputError, NotConvergedError
 from .evaluate import ViewEvaluation, evaluate_view, table
 from .io.clouds import open_cloud
 from .io.images import PhotoInfo, photo_info
@@ -31,7 +31,7 @@ ORDINARY_FOCAL = 0.85
 class RegisterOptions:
     """How a view is estimated. ``free`` of ``None``: the pose, and the focal length where no calibration is given."""
 
-    method: Literal["dlt", "resection"] = "resection"
+    method: Literal["dlt", "resection", "sci"] = "resection"
     free: tuple[str, ...] | None = None
     priors: tuple[str, ...] = ()
     sigma_xy: float = 0.5
@@ -145,6 +145,9 @@ def register_photo(
     options = options or RegisterOptions()
     cloud, photo = Path(cloud), Path(photo)
     info = photo_info(photo)
+    if options.method == "sci":
+        start = _starting_view(photo, info, Path(init) if init else None, Path(camera) if camera else None)
+        return _by_sci(cloud, photo, start, options)
     if points is None:
         raise InvalidInputError(
             f"method {options.method} needs control points: give a table with the columns name,X,Y,Z,x,y with --points"
@@ -309,6 +312,38 @@ def _by_resection(
         facts={
             "error_in_the_middle_px": round(result.centre_error, 3),
             "error_at_the_border_px": round(result.border_error, 3),
+        },
+    )
+
+
+def _by_sci(cloud: Path, photo: Path, start: _Start, options: RegisterOptions) -> RegisterResult:
+    """From the approximate view, without control points. A result that cannot be trusted is an error."""
+    from .io.clouds import read_cloud
+    from .io.images import read_photo
+    from .register_sci import SciOptions, register_sci
+
+    if start.pose is None:
+        raise InvalidInputError("method sci starts from an approximate view: give a registration with --init")
+    free = options.free or ("pose",)
+    given = View(photo.stem, photo, start.camera, start.pose)
+    priors = tuple(parse_prior(text) for text in options.priors)
+    points = read_cloud(cloud)
+    found = register_sci(points, read_photo(photo).pixels, given, SciOptions(free=free, priors=priors))
+    if not found.trusted:
+        raise NotConvergedError(f"no registration that can be trusted: {'; '.join(found.reasons)}")
+    last = found.turns[-1]
+    return RegisterResult(
+        registration=Registration((found.view,), cloud, points.crs_wkt),
+        evaluation=evaluate_view(found.view),
+        notes=(f"{start.origin}; free: {', '.join(free)}",),
+        free=free,
+        facts={
+            "matches_used": found.used,
+            "matches_found": last.matched,
+            "templates": last.templates,
+            "confirmed_share": round(found.confirmed, 3),
+            "confirmed_by_chance": round(found.by_chance, 3),
+            "predicted_error_px": round(found.predicted_error, 3),
         },
     )
 

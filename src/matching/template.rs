@@ -158,13 +158,23 @@ pub struct Match {
     pub score: f32,
     /// The score of the next peak, 0 if there is none.
     pub second: f32,
+    /// The score without any shift; NaN where it is not known.
+    pub here: f32,
     /// Whether it may be used.
     pub outcome: Outcome,
 }
 
 impl Match {
-    fn refused(template: usize, outcome: Outcome) -> Self {
-        Self { template, shift: [f64::NAN; 2], covariance: [f64::NAN; 3], score: f32::NAN, second: f32::NAN, outcome }
+    fn refused(template: usize, outcome: Outcome, here: f32) -> Self {
+        Self {
+            template,
+            shift: [f64::NAN; 2],
+            covariance: [f64::NAN; 3],
+            score: f32::NAN,
+            second: f32::NAN,
+            here,
+            outcome,
+        }
     }
 }
 
@@ -236,7 +246,7 @@ fn search_one(
     fourier: Option<&Fourier>,
 ) -> Result<Vec<Match>> {
     let at = Placement { x: point[0], y: point[1], half: options.half, radius: options.radius, least_overlap: 0.6 };
-    let refused = |outcome| Ok(vec![Match::refused(index, outcome)]);
+    let refused = |outcome| Ok(vec![Match::refused(index, outcome, f32::NAN)]);
     let measure = sci.measure;
     let (sci, photo) = (&sci.stack, &photo.stack);
     let (surface, pixels) = match measure {
@@ -267,8 +277,9 @@ fn independent_area(measure: &Measure) -> f64 {
 fn judge(surface: &Surface, samples: f64, index: usize, options: &TemplateOptions) -> Vec<Match> {
     let wanted = options.hypotheses.max(1);
     let peaks = highest(surface, wanted.max(2), options.apart);
+    let here = surface.scores[surface.scores.len() / 2];
     if peaks.is_empty() || (wanted == 1 && best_is_at_the_border(surface)) {
-        return vec![Match::refused(index, Outcome::AtTheBorder)];
+        return vec![Match::refused(index, Outcome::AtTheBorder, here)];
     }
     let second = peaks.get(1).map_or(0.0, |p| p.score.max(0.0));
     peaks
@@ -291,6 +302,7 @@ fn judge(surface: &Surface, samples: f64, index: usize, options: &TemplateOption
                 covariance: covariance.unwrap_or([f64::NAN; 3]),
                 score: peak.score,
                 second,
+                here,
                 outcome,
             }
         })

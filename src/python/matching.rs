@@ -162,6 +162,7 @@ fn match_templates<'py>(
     out.set_item("covariance", owned_rows(py, found.iter().map(|m| m.covariance).collect())?)?;
     out.set_item("score", PyArray1::from_iter(py, found.iter().map(|m| m.score)))?;
     out.set_item("second", PyArray1::from_iter(py, found.iter().map(|m| m.second)))?;
+    out.set_item("here", PyArray1::from_iter(py, found.iter().map(|m| m.here)))?;
     let code = |o: Outcome| Outcome::ALL.iter().position(|x| *x == o).unwrap_or(usize::MAX) as u8;
     out.set_item("outcome", PyArray1::from_iter(py, found.iter().map(|m| code(m.outcome))))?;
     Ok(out)

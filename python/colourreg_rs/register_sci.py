@@ -1,0 +1,408 @@
+"""From an approximate view to a registration, without picking: the loop of SCI, matching and resection.
+
+The SCI is rendered at the current view and matched with the photo; each match gives a point of the cloud and its place
+in the photo; a robust resection gives the next view; and the SCI is rendered again, until the view stands still.
+Coarse to fine: at the coarsest level templates span many degrees and are searched over the whole of the start's
+uncertainty; the finest level is the one that the cloud's density supports. The single pass of Forkuo and King is one
+turn of it.
+
+A result is believed only if templates that are searched far beyond their own noise come back to where they were
+(``confirmed``); one that is not is returned as a failure, with the figures that say so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from . import _core
+from .correspondences import (
+    Correspondences,
+    PhotoPyramid,
+    Search,
+    find_correspondences,
+    pixels_per_radian,
+    supported_scale,
+)
+from .errors import DegenerateError, InvalidInputError, NotConvergedError
+from .match_covariance import design, match_covariance, tukey_weights
+from .model import Covariance, FloatArray, PointCloud, Pose, View
+from .sci import SCI
+
+#: Interest points per point of the SCI's own density: the finest level has this many pixels per spacing of the points.
+OVERSAMPLING = 1.5
+
+#: The coarsest level has about this many pixels along the long side.
+COARSEST = 300
+
+#: Residuals beyond this many stated sigmas do not pull. Matches are sharper than their stated sigma (their median is
+#: half of it on simulated scenes), so that one half of it is the unit.
+UNIT = 0.5
+
+
+@dataclass(frozen=True)
+class SciOptions:
+    """How a view is registered to the SCI.
+
+    - ``free``: what is estimated; camera parameters only at the finest level.
+    - ``search``: how far off the start may be, radians, position and rotation together as seen in the photo.
+    - ``shift``: how far off the start's projection centre may be, metres, one sigma; for the coarse levels only.
+    - ``priors``: (name, value, sigma) of parameters known before, as in resection; they hold at every level.
+    - ``tolerance``: the loop ends when the view moves less than this anywhere in the photo, px.
+    - ``passes``: at most this many turns at the finest level; 1 with ``single`` is the single pass of the literature.
+    - ``single``: one turn at the finest level and nothing else.
+    - ``station``: (3,) where the scanner stood, for the correction of the intensity.
+    """
+
+    free: tuple[str, ...] = ("pose",)
+    search: float = float(np.radians(6.0))
+    shift: float = 0.5
+    priors: tuple[tuple[str, float, float], ...] = ()
+    tolerance: float = 0.1
+    passes: int = 10
+    single: bool = False
+    station: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Turn:
+    """One turn of the loop: at ``scale`` of the photo, ``templates`` were searched, ``matched`` found, ``used`` agreed
+    with the new view, which ``moved`` this far at most anywhere in the photo, px."""
+
+    scale: float
+    templates: int
+    matched: int
+    used: int
+    moved: float
+
+
+@dataclass(frozen=True)
+class SciRegistration:
+    """What the loop came to.
+
+    - ``view``: the new view with its covariance, or the start where the result is not to be believed.
+    - ``trusted`` and ``reasons``: whether it is, and why not.
+    - ``turns``: what happened.
+    - ``confirmed``: of templates searched over a wide window at the result, the share that came back to within
+      ``confirmed_within`` px of the photo; by chance it would be ``by_chance``.
+    - ``correspondences`` and ``weights``: of the last turn; weight 0 took no part.
+    - ``predicted_error``: rms over the photo of the position error that the covariance predicts, px per coordinate.
+    - ``improvement``: mean likeness at the result less that at the start, of the same points, and its standard error.
+    """
+
+    view: View
+    trusted: bool
+    reasons: tuple[str, ...]
+    turns: tuple[Turn, ...]
+    confirmed: float
+    confirmed_within: float
+    by_chance: float
+    correspondences: Correspondences | None
+    weights: FloatArray
+    predicted_error: float
+    improvement: tuple[float, float]
+    statistics: dict[str, Any]
+
+    @property
+    def used(self) -> int:
+        """Matches that took part."""
+        return int((self.weights > 0).sum())
+
+
+class _LoopError(Exception):
+    """The loop cannot go on; the message says why."""
+
+
+def register_sci(
+    cloud: PointCloud | Iterable[PointCloud],
+    photo: npt.NDArray[Any],
+    view: View,
+    options: SciOptions | None = None,
+) -> SciRegistration:
+    """Refines an approximate view of a photo (H, W) or (H, W, 3) against a cloud with intensity or colour.
+
+    A start that is farther off than ``options.search`` is not found, and said so: then ``trusted`` is false and the
+    view is the start. Raises InvalidInputError where photo, camera and cloud do not fit each other.
+    """
+    options = options or SciOptions()
+    if view.camera is None or view.pose is None:
+        raise InvalidInputError(
+            f"view {view.name!r}: registration by SCI starts from a camera and a pose, not from a DLT"
+        )
+    if photo.ndim not in (2, 3) or photo.shape[:2] != (view.camera.height, view.camera.width):
+        raise InvalidInputError(
+            f"the photo of {photo.shape[1] if photo.ndim > 1 else 0} x {photo.shape[0]} pixels is not that of the "
+            f"camera, {view.camera.width} x {view.camera.height}"
+        )
+    whole = cloud if isinstance(cloud, PointCloud) else _joined(cloud)
+    return _Loop(whole, PhotoPyramid.of(photo), view, options).run()
+
+
+def _joined(chunks: Iterable[PointCloud]) -> PointCloud:
+    parts = list(chunks)
+    if not parts:
+        raise InvalidInputError("the cloud has no points")
+
+    def column(name: str) -> Any:
+        values = [getattr(p, name) for p in parts]
+        return None if any(v is None for v in values) else np.concatenate(values)
+
+    return PointCloud(column("xyz"), column("intensity"), column("rgb"), column("normals"))
+
+
+class _Loop:
+    def __init__(self, cloud: PointCloud, photo: PhotoPyramid, start: View, options: SciOptions) -> None:
+        self.cloud, self.photo, self.start, self.options = cloud, photo, start, options
+        self.turns: list[Turn] = []
+        self.exponents: tuple[float, float] | None = None
+        self.station = None if options.station is None else np.array(options.station, dtype=np.float64)
+        camera = start.camera
+        assert camera is not None
+        self.long_side = max(camera.width, camera.height)
+        # Where movement and predicted errors are looked at: points of the cloud all over the photo.
+        self.witnesses = np.empty((0, 3))
+
+    def run(self) -> SciRegistration:
+        try:
+            view = self._iterate()
+        except _LoopError as failure:
+            return self._failed(str(failure))
+        except (DegenerateError, NotConvergedError) as error:
+            return self._failed(str(error))
+        return self._judged(view)
+
+    # The turns -------------------------------------------------------------------------------------------------
+
+    def _scales(self) -> list[float]:
+        supported = supported_scale(self.cloud, self.start)
+        if supported == 0.0:
+            raise _LoopError("no point of the cloud lies in the photo at the start")
+        finest = min(1.0, OVERSAMPLING * supported)
+        scales = [finest]
+        while not self.options.single and scales[0] * self.long_side > 1.5 * COARSEST:
+            scales.insert(0, scales[0] / 2)
+        return scales
+
+    def _iterate(self) -> View:
+        view, scales = self.start, self._scales()
+        for level, scale in enumerate(scales):
+            finest = level == len(scales) - 1
+            per_radian = pixels_per_radian(self.start) * scale
+            for turn in range(self.options.passes if finest else 4):
+                if level == 0 and turn == 0:
+                    radius = int(np.clip(np.ceil(self.options.search * per_radian), 4, 80))
+                    search = Search(half=24 if not finest else 12, radius=radius, cell=8, per_cell=2, hypotheses=3)
+                elif level == 0 and not finest:
+                    search = Search(half=20 if turn == 1 else 16, radius=8, cell=8)
+                else:
+                    search = Search(radius=8 if turn == 0 else 4, cell=max(8, round(scale * self.long_side / 50)))
+                found = self._find(view, scale, search)
+                first = search.hypotheses > 1
+                new = self._resect(self._consensus(view, found) if first else view, found, finest and not first, first)
+                moved = self._moved(view, new)
+                weights = self._weights(new, found)
+                self.turns.append(Turn(scale, found.templates, len(found), int((weights > 0).sum()), moved))
+                view = new
+                self.last = found
+                if self.options.single:
+                    break
+                enough = self.options.tolerance if finest else 0.5 / scale
+                if moved < enough and not (level == 0 and turn == 0):
+                    break
+        return view
+
+    def _find(self, view: View, scale: float, search: Search) -> Correspondences:
+        found, sci = find_correspondences(
+            self.cloud, view, self.photo, scale, search, station=self.station, exponents=self.exponents
+        )
+        self.exponents = sci.exponents
+        if len(self.witnesses) == 0:
+            self.witnesses = self._spread_points(sci)
+        if len(found) < 12:
+            counts = ", ".join(f"{n} {name}" for name, n in found.outcomes.items() if n)
+            raise _LoopError(
+                f"only {len(found)} of {found.templates} templates were found in the photo at "
+                f"{scale:.3f} of its size ({counts or 'no interest points'}); at least 12 are needed"
+            )
+        return found
+
+    def _spread_points(self, sci: SCI) -> FloatArray:
+        rows, columns = np.nonzero(sci.measured)
+        if len(rows) == 0:
+            raise _LoopError("no point of the cloud lies in the photo at the start")
+        step = max(len(rows) // 2000, 1)
+        return np.ascontiguousarray(self.cloud.xyz[sci.index[rows[::step], columns[::step]]])
+
+    def _consensus(self, view: View, found: Correspondences) -> View:
+        """The rotation that most templates agree on, each with the best of its hypotheses, from pairs of matches."""
+        core = view.core
+        towards = found.xyz - core.centre
+        towards /= np.linalg.norm(towards, axis=1)[:, None]
+        seen = _core.unproject(core, found.xy)
+        ok = np.isfinite(seen).all(1)
+        towards, seen, template = towards[ok], seen[ok], found.template[ok]
+        tolerance = max(2.0 * found.pixel / pixels_per_radian(view), np.radians(0.8))
+        rng = np.random.default_rng(0)
+        pairs = rng.integers(0, len(seen), (6000, 2))
+        a, b = pairs.T
+        cos_world, cos_photo = (towards[a] * towards[b]).sum(1), (seen[a] * seen[b]).sum(1)
+        apart = np.arccos(np.clip(cos_photo, -1, 1))
+        fits = np.abs(np.arccos(np.clip(cos_world, -1, 1)) - apart) < tolerance
+        keep = (template[a] != template[b]) & fits & (apart > np.radians(4.0))
+        a, b = a[keep][:1500], b[keep][:1500]
+        if len(a) == 0:
+            return view
+        turns = np.einsum("kij,klj->kil", _frames(towards[a], towards[b]), _frames(seen[a], seen[b]))
+        angle = np.arccos(np.clip((np.trace(turns, axis1=1, axis2=2) - 1) / 2, -1, 1))
+        turns = np.concatenate([np.eye(3)[None], turns[angle < 1.5 * self.options.search]])
+        turned = np.einsum("kij,nj->kni", turns, seen)
+        miss = 1 - np.einsum("kni,ni->kn", turned, towards)
+        score = np.maximum(0, 1 - 2 * miss / tolerance**2)
+        first = np.flatnonzero(np.r_[True, template[1:] != template[:-1]])
+        total = np.maximum.reduceat(score, first, axis=1).sum(1)
+        best = turns[int(np.argmax(total))]
+        pose = view.pose
+        assert pose is not None
+        # x_cam = R X: what was seen in the direction R⁻¹x is in truth in the direction best · R⁻¹x.
+        rotation = pose.rotation @ best.T
+        u, _, v = np.linalg.svd(rotation)
+        return replace(view, pose=Pose.from_centre(u @ v, core.centre))
+
+    def _resect(self, view: View, found: Correspondences, final: bool, first: bool) -> View:
+        """Robust resection from here; the first one from afar, step by step."""
+        free = list(self.options.free) if final else ["pose"]
+        priors = list(self.options.priors)
+        held = {name for name, _, _ in priors}
+        if not final:
+            centre = self.start.core.centre
+            for k, name in enumerate(("cx_world", "cy_world", "cz_world")):
+                if name not in held:
+                    priors.append((name, float(centre[k]), self.options.shift))
+        core = view.core
+        self.names: list[str] = []
+        for unit in (8.0, 3.0, 1.0) if first else (UNIT,):
+            result = _core.resect(
+                core, found.xyz, found.xy, free=free, sigma_xy=found.covariance * unit**2, priors=priors,
+                loss="tukey", start="given",
+            )  # fmt: skip
+            core, self.names = result.view, result.parameters
+        camera = view.camera
+        assert camera is not None
+        params = dict(zip(camera.params, core.params.tolist(), strict=True))
+        return replace(view, camera=replace(camera, params=params), pose=Pose(core.rotation, core.translation))
+
+    def _weights(self, view: View, found: Correspondences) -> FloatArray:
+        return tukey_weights(view, found.xyz, found.xy, found.covariance * UNIT**2)
+
+    def _moved(self, before: View, after: View) -> float:
+        a, _ = _core.project(before.core, self.witnesses)
+        b, _ = _core.project(after.core, self.witnesses)
+        distance = np.linalg.norm(a - b, axis=1)
+        distance = distance[np.isfinite(distance)]
+        return float(distance.max()) if len(distance) else float("inf")
+
+    # The verdict -----------------------------------------------------------------------------------------------
+
+    def _judged(self, view: View) -> SciRegistration:
+        found = self.last
+        weights = self._weights(view, found)
+        reasons: list[str] = []
+        last = self.turns[-1]
+        if not self.options.single and last.moved >= self.options.tolerance:
+            reasons.append(f"the view still moves by {last.moved:.2f} px after {len(self.turns)} turns")
+        used = weights > 0
+        if used.sum() < 20:
+            reasons.append(f"only {int(used.sum())} matches agree with the view; 20 are needed")
+        covariance = match_covariance(view, self.names, found.xyz, found.xy, found.covariance * UNIT**2, found.pixel)
+        predicted = float("nan")
+        if covariance is None:
+            reasons.append("the matches do not determine the view")
+        else:
+            predicted = self._predicted_error(view, covariance)
+            view = replace(view, covariance=covariance)
+            if predicted > 5.0:
+                reasons.append(f"the predicted error over the photo is {predicted:.1f} px; the matches are too few")
+        confirmed, within, by_chance, wide = self._confirmed(view)
+        if confirmed < max(0.25, 5 * by_chance):
+            reasons.append(
+                f"of {wide} templates searched over a wide window only {100 * confirmed:.0f} % come back to within "
+                f"{within:.1f} px of their place; by chance it would be {100 * by_chance:.0f} %"
+            )
+        improvement = self._improvement(view)
+        if improvement[0] < -2 * improvement[1]:
+            reasons.append(
+                f"the start fits better: mean likeness {improvement[0]:+.4f} ± {improvement[1]:.4f} against it"
+            )
+        statistics = {
+            "matches": len(found), "used": int(used.sum()), "turns": len(self.turns), "confirmed": confirmed,
+            "confirmed_by_chance": by_chance, "predicted_error_px": predicted, "last_move_px": last.moved,
+            "improvement": improvement[0],
+        }  # fmt: skip
+        trusted = not reasons
+        result = replace(view, method="sci", statistics=statistics) if trusted else self.start
+        return SciRegistration(
+            result, trusted, tuple(reasons), tuple(self.turns), confirmed, within, by_chance, found, weights,
+            predicted, improvement, statistics,
+        )  # fmt: skip
+
+    def _failed(self, reason: str) -> SciRegistration:
+        nan = float("nan")
+        return SciRegistration(
+            self.start, False, (reason,), tuple(self.turns), 0.0, nan, nan, None, np.empty(0), nan, (nan, nan), {}
+        )
+
+    def _predicted_error(self, view: View, covariance: Covariance) -> float:
+        """Rms over the photo of the predicted position error, px per coordinate."""
+        rows = design(view, covariance.parameters, self.witnesses)
+        rows = rows[np.isfinite(rows).all((1, 2))]
+        variances = np.einsum("nij,jk,nik->ni", rows, covariance.matrix, rows)
+        return float(np.sqrt(variances.mean())) if len(rows) else float("nan")
+
+    def _confirmed(self, view: View) -> tuple[float, float, float, int]:
+        """Templates of twice the area, searched a dozen pixels around one level up, that come back."""
+        scale = self.turns[-1].scale * (0.5 if self.turns[-1].scale * self.long_side > COARSEST else 1.0)
+        radius, within = 12, 1.5
+        try:
+            found, _ = find_correspondences(
+                self.cloud, view, self.photo, scale, Search(half=16, radius=radius, cell=12, per_cell=1),
+                station=self.station, exponents=self.exponents,
+            )  # fmt: skip
+        except DegenerateError:
+            return 0.0, within / scale, 1.0, 0
+        by_chance = float(np.pi * within**2 / (2 * radius - 1) ** 2)
+        if found.templates == 0:
+            return 0.0, within / scale, by_chance, 0
+        projected, _ = _core.project(view.core, found.xyz)
+        near = np.linalg.norm(projected - found.xy, axis=1) < within * found.pixel
+        searched = found.templates - found.outcomes["unknown"]
+        return float(near.sum() / max(searched, 1)), within / scale, by_chance, searched
+
+    def _improvement(self, view: View) -> tuple[float, float]:
+        """Mean likeness without a shift at the result less that at the start, and its standard error."""
+        scale, search = self.turns[-1].scale, Search(radius=2)
+        likeness = []
+        for v in (self.start, view):
+            try:
+                found, _ = find_correspondences(
+                    self.cloud, v, self.photo, scale, search, station=self.station, exponents=self.exponents
+                )
+            except DegenerateError:
+                return (float("inf"), 0.0)
+            likeness.append(found.here)
+        a, b = likeness
+        if len(a) < 10 or len(b) < 10:
+            return (float("inf") if len(b) > len(a) else float("-inf"), 0.0)
+        return float(b.mean() - a.mean()), float(np.sqrt(a.var() / len(a) + b.var() / len(b)))
+
+
+def _frames(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Orthonormal frames (K, 3, 3), in columns, of pairs of unit directions."""
+    middle = a + b
+    middle /= np.linalg.norm(middle, axis=1)[:, None]
+    side = b - a
+    side /= np.linalg.norm(side, axis=1)[:, None]
+    return np.stack([middle, side, np.cross(middle, side)], axis=2)

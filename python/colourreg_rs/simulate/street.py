@@ -70,7 +70,7 @@ def advertising_column(b: Builder, foot: tuple[float, float, float], rng: np.ran
         while at < around - 0.3:
             w = float(rng.uniform(0.5, 0.85))
             low = base + float(rng.uniform(0.0, 0.25))
-            if rng.random() < 0.62 and at + w < around:
+            if rng.random() < 0.85 and at + w < around:
                 layers.append(materials.painted(artwork.poster(rng, w, 1.41 * w), at, low, at + w, low + 1.41 * w))
             at += w + float(rng.uniform(-0.02, 0.08))
     body = Material(tuple(layers))

@@ -21,7 +21,7 @@ def _square(rng: np.random.Generator, points: float, photos: int) -> Layout:
     second = buildings.random_style(rng, wall="brick")
     buildings.facade(b.place((-4.0 + width, 0.8, 0)), 10.0, 2, second, rng, name="right", depth=9.0)
     # The wing stands nearly along the line of sight: it is scanned and photographed at grazing angles.
-    wing = buildings.random_style(rng)
+    wing = buildings.random_style(rng, wall=str(rng.choice(["brick", "stone", "plaster"])))
     turn = float(rng.uniform(np.radians(78), np.radians(86)))
     long = float(rng.uniform(12.0, 15.0))
     buildings.facade(

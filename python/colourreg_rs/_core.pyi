@@ -274,8 +274,9 @@ def match_templates(
 
     Columns: ``template`` (M,) int64, the point's row; ``shift`` (M, 2) float64, photo minus SCI, px; ``covariance``
     (M, 3), xx xy yy, px², by least squares matching; ``score`` and ``second`` (M,) float32, of the best and the next
-    peak; ``here`` (M,) float32, the score without a shift; ``outcome`` (M,) uint8, see :data:`MATCH_OUTCOMES`. One row for each template, or, with several
-    ``hypotheses``, one for each peak; then ambiguity is left to the caller. Raises InvalidInputError."""
+    peak; ``here`` (M,) float32, the score without a shift; ``outcome`` (M,) uint8, see
+    :data:`MATCH_OUTCOMES`. One row for each template, or, with several ``hypotheses``, one for each peak; then
+    ambiguity is left to the caller. Raises InvalidInputError."""
 
 def relief(inverse_depth: npt.NDArray[np.float32], points: npt.NDArray[np.int64], half: int) -> npt.NDArray[np.float64]:
     """How far the surface within ``half`` px around each point (N, 2: column, row) departs from a plane: rms (N,),

@@ -171,8 +171,7 @@ def _surface_sigma(view: View, options: ColouriseOptions) -> _core.SurfaceSigma 
     if view.covariance is None:
         return None
     names, matrix = list(view.covariance.parameters), view.covariance.matrix
-    noise = {"sigma_image": options.sigma_image, "sigma_xyz": options.sigma_xyz}
-    return _core.SurfaceSigma(view.core, names, matrix, **noise)
+    return _core.SurfaceSigma(view.core, names, matrix, sigma_image=options.sigma_image, sigma_xyz=options.sigma_xyz)
 
 
 def load_views(paths: Sequence[Path]) -> tuple[list[View], list[Photo]]:

@@ -9,7 +9,7 @@ import pytest
 from adjustment_cases import case
 
 from colourreg_rs import Covariance, _core
-from colourreg_rs.colourise import Colouriser, ColouriseOptions
+from colourreg_rs.colourise import ColouriseOptions, Colouriser
 
 
 @pytest.fixture

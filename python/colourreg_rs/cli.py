@@ -213,7 +213,13 @@ def register(
         list[str] | None,
         typer.Option(help="Hold a parameter softly: NAME=VALUE±SIGMA (or NAME=VALUE+-SIGMA); sigma 0 holds it."),
     ] = None,
-    sigma: Annotated[float, typer.Option(help="Sigma of a photo coordinate in pixels, where the list has none.")] = 0.5,
+    sigma: Annotated[
+        float | None,
+        typer.Option(help="Sigma of a photo coordinate in pixels, where the list has none; else from the residuals."),
+    ] = None,
+    sigma_xyz: Annotated[
+        float | None, typer.Option(help="Sigma of an object coordinate in metres, where the list has none; else 0.")
+    ] = None,
     loss: Annotated[str | None, typer.Option(help="Robust loss instead of rejection: huber, cauchy, tukey.")] = None,
     distortion: Annotated[
         str, typer.Option(help="Distortion terms beside a DLT matrix, for example k1,k2,p1,p2.")
@@ -230,6 +236,7 @@ def register(
         free=tuple(name.strip() for name in free.split(",") if name.strip()) if free else None,
         priors=tuple(prior or ()),
         sigma_xy=sigma,
+        sigma_xyz=sigma_xyz,
         loss=loss,
         distortion=tuple(name.strip() for name in distortion.split(",") if name.strip()),
         dlt_parameters=dlt_parameters,

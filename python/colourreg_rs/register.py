@@ -21,7 +21,8 @@ from .io.clouds import open_cloud
 from .io.images import PhotoInfo, photo_info
 from .io.points import read_points
 from .io.registration import read_camera, read_registration, write_registration
-from .model import DLT_DISTORTION_NAMES, Camera, ControlPoint, Covariance, FloatArray, Pose, Registration, View
+from .model import DLT_DISTORTION_NAMES, Camera, ControlPoint, Covariance, Pose, Registration, View
+from .view_adjustment import AdjustedView, PointSigmas, adjust_control, rotation_priors
 
 #: The focal length, in units of the photo's long side, that a photo without EXIF is first taken to have.
 ORDINARY_FOCAL = 0.85
@@ -29,16 +30,26 @@ ORDINARY_FOCAL = 0.85
 
 @dataclass(frozen=True)
 class RegisterOptions:
-    """How a view is estimated. ``free`` of ``None``: the pose, and the focal length where no calibration is given."""
+    """How a view is estimated. ``free`` of ``None``: the pose, and the focal length where no calibration is given.
+
+    ``sigma_xy`` (px) and ``sigma_xyz`` (m, each axis) hold where the list of points has none. Without either the sigma
+    in the photo is found from the residuals, and the coordinates in space are taken as exact.
+    """
 
     method: Literal["dlt", "resection", "sci"] = "resection"
     free: tuple[str, ...] | None = None
     priors: tuple[str, ...] = ()
-    sigma_xy: float = 0.5
+    sigma_xy: float | None = None
+    sigma_xyz: float | None = None
     loss: str | None = None
     distortion: tuple[str, ...] = ()
     dlt_parameters: int = 11
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, value in (("sigma", self.sigma_xy), ("sigma-xyz", self.sigma_xyz)):
+            if value is not None and not (np.isfinite(value) and value >= 0):
+                raise InvalidInputError(f"--{name} {value} is not possible: give a positive number")
 
 
 @dataclass(frozen=True)
@@ -250,10 +261,6 @@ def _check_photo_coordinates(control: Sequence[ControlPoint], info: PhotoInfo, p
         )
 
 
-def _sigmas(control: Sequence[ControlPoint], fallback: float) -> FloatArray:
-    return np.stack([p.sigma_xy if p.sigma_xy is not None else np.full(2, fallback) for p in control])
-
-
 _PRIOR = re.compile(r"^\s*(\w+)\s*=\s*([^±]+?)\s*(?:±|\+-|\+/-)\s*(\S+)\s*$")
 
 
@@ -271,49 +278,93 @@ def parse_prior(text: str) -> tuple[str, float, float]:
 def _by_resection(
     photo: Path, control: Sequence[ControlPoint], start: _Start, options: RegisterOptions
 ) -> RegisterResult:
-    """Resection: robust against blunders, unless a robust loss was asked for instead."""
+    """Resection: robust against blunders and then adjusted, unless a robust loss was asked for instead."""
     free = options.free or (("pose",) if start.calibrated else ("pose", "f"))
-    xyz, xy = np.stack([p.xyz for p in control]), np.stack([p.xy for p in control])
-    check = np.array([p.role == "check" for p in control])
     pose = start.pose or Pose(np.eye(3), np.zeros(3))
     given = View(photo.stem, photo, start.camera, pose)
     priors = [parse_prior(text) for text in options.priors]
-    common: dict[str, Any] = {
-        "free": list(free),
-        "sigma_xy": _sigmas(control, options.sigma_xy),
-        "priors": priors,
-        "check": check,
-    }
-    if options.loss is not None:
-        result = _core.resect(given.core, xyz, xy, loss=options.loss, **common)
-    else:
-        unknown = not start.calibrated and "focal length unknown" in start.origin
-        result = _core.resect_robust(given.core, xyz, xy, seed=options.seed, unknown_focal=unknown, **common)
-    core = result.view
+    sigmas = PointSigmas.of(control, options.sigma_xy, options.sigma_xyz)
+    rough, sigmas = _approximate(given, control, sigmas, start, free, priors, options)
+    warnings = tuple(w.message for w in rough.verdict.warnings)
+    errors = rough.centre_error, rough.border_error
+    adjusted = None
+    if options.loss is None:
+        held = {name for name, _, sigma in priors if sigma == 0}
+        soft = [prior for prior in priors if prior[0] not in held]
+        names = [name for name in rough.parameters if name not in held]
+        soft = rotation_priors(soft, given.core.rotation, rough.view.rotation)
+        try:
+            adjusted = adjust_control(rough.view, control, rough.status, sigmas, names, priors=soft)
+        except (DegenerateError, NotConvergedError) as error:
+            warnings = (*warnings, f"not adjusted, statistics of the points are missing: {error}")
+    if adjusted is not None:
+        # What the adjustment says again, and better.
+        repeated = {"correlation", "variance_factor"}
+        kept = [w.message for w in rough.verdict.warnings if w.code not in repeated or w.fatal]
+        warnings = (*kept, *adjusted.warnings)
+        errors = _predicted_errors(adjusted, control)
+    core = adjusted.core if adjusted else rough.view
     camera = replace(start.camera, params=dict(zip(start.camera.params, core.params.tolist(), strict=True)))
     view = View(
         name=photo.stem,
         image=photo,
         camera=camera,
         pose=Pose(core.rotation, core.translation),
-        covariance=_covariance(result),
+        covariance=Covariance(adjusted.parameters, adjusted.covariance) if adjusted else _covariance(rough),
         method="resection",
-        points=_judged(control, result),
-        statistics=_statistics(result),
+        points=adjusted.points if adjusted else _judged(control, rough),
+        statistics=adjusted.statistics if adjusted else _statistics(rough),
     )
-    verdict = result.verdict
     return RegisterResult(
         registration=Registration((view,)),
         evaluation=evaluate_view(view),
-        notes=(f"{start.origin}; free: {', '.join(free)}",),
-        warnings=tuple(w.message for w in verdict.warnings),
-        trusted=verdict.ok,
+        notes=(f"{start.origin}; free: {', '.join(free)}", sigmas.describe()),
+        warnings=warnings,
+        trusted=rough.verdict.ok and (adjusted is not None or options.loss is not None),
         free=tuple(free),
-        facts={
-            "error_in_the_middle_px": round(result.centre_error, 3),
-            "error_at_the_border_px": round(result.border_error, 3),
-        },
+        facts={"error_in_the_middle_px": round(errors[0], 3), "error_at_the_border_px": round(errors[1], 3)},
     )
+
+
+def _approximate(
+    given: View,
+    control: Sequence[ControlPoint],
+    sigmas: PointSigmas,
+    start: _Start,
+    free: Sequence[str],
+    priors: Sequence[tuple[str, float, float]],
+    options: RegisterOptions,
+) -> tuple[_core.ResectionResult, PointSigmas]:
+    """A view and its blunders, judged by the photo's and the object's sigmas together; the sigmas, completed."""
+    xyz, xy = np.stack([p.xyz for p in control]), np.stack([p.xy for p in control])
+    check = np.array([p.role == "check" for p in control])
+    common: dict[str, Any] = {"free": list(free), "priors": list(priors), "check": check}
+    known = sigmas.covariance_xy if sigmas.photo_known else None
+    if options.loss is not None:
+        return _core.resect(given.core, xyz, xy, loss=options.loss, sigma_xy=known, **common), sigmas
+    common |= {"seed": options.seed}
+    common |= {"unknown_focal": not start.calibrated and "focal length unknown" in start.origin}
+    uncertain = bool((sigmas.space > 0).any())
+    # How large the object's noise is in the photo shows only from a view: the first one judges by its own residuals.
+    rough = _core.resect_robust(given.core, xyz, xy, sigma_xy=None if uncertain else known, **common)
+    if uncertain and sigmas.photo_known:
+        seen = sigmas.seen_from(rough.view, xyz)
+        rough = _core.resect_robust(given.core, xyz, xy, sigma_xy=seen, **common)
+    elif uncertain:
+        used = np.array([s == "used" for s in rough.status]) & ~check
+        seen = sigmas.seen_from(rough.view, xyz)
+        sigmas = sigmas.with_photo_from(np.asarray(rough.residuals), used, len(rough.parameters), seen)
+    return rough, sigmas
+
+
+def _predicted_errors(adjusted: AdjustedView, control: Sequence[ControlPoint]) -> tuple[float, float]:
+    """What the covariance does at the middle and, at worst, at the border, px per coordinate, at a usual distance."""
+    _, depths = _core.project(adjusted.core, np.stack([p.xyz for p in control]))
+    depth = float(np.nanmedian(depths))
+    grid = _core.predicted_error_map(adjusted.core, list(adjusted.parameters), adjusted.covariance, depth, 3, 3)
+    sigma = grid["sigma_px"]
+    border = np.delete(sigma.ravel(), 4)
+    return float(sigma[1, 1]), float(np.nanmax(border)) if np.isfinite(border).any() else float("nan")
 
 
 def _by_sci(cloud: Path, photo: Path, start: _Start, options: RegisterOptions) -> RegisterResult:
@@ -369,12 +420,14 @@ def _statistics(result: Any) -> dict[str, float]:
 
 
 def _by_dlt(photo: Path, info: PhotoInfo, control: Sequence[ControlPoint], options: RegisterOptions) -> RegisterResult:
-    """Direct Linear Transformation: nothing is known of the camera, and every point is believed."""
+    """Direct Linear Transformation: nothing is known of the camera. Eleven parameters are adjusted, and their blunders
+    found; the singular vector of twelve is left as it is."""
     unknown = sorted(set(options.distortion) - set(DLT_DISTORTION_NAMES))
     if unknown:
         raise InvalidInputError(
             f"a DLT has no distortion term {', '.join(unknown)}; it takes {', '.join(DLT_DISTORTION_NAMES)}"
         )
+    sigmas = PointSigmas.of(control, options.sigma_xy, options.sigma_xyz)
     result = _core.estimate_dlt(
         np.stack([p.xyz for p in control]),
         np.stack([p.xy for p in control]),
@@ -382,30 +435,55 @@ def _by_dlt(photo: Path, info: PhotoInfo, control: Sequence[ControlPoint], optio
         info.height,
         method=options.dlt_parameters,
         distortion=list(options.distortion),
-        sigma_xy=_sigmas(control, options.sigma_xy),
+        sigma_xy=sigmas.covariance_xy if sigmas.photo_known else None,
         check=np.array([p.role == "check" for p in control]),
     )
-    core = result.view
+    warnings = tuple(w.message for w in result.verdict.warnings)
+    trusted, adjusted = result.verdict.ok, None
+    if options.dlt_parameters == 11:
+        try:
+            adjusted = adjust_control(result.view, control, result.status, sigmas, options.distortion, dlt=True)
+        except (DegenerateError, NotConvergedError) as error:
+            warnings = (*warnings, f"not adjusted, statistics of the points are missing: {error}")
+    if adjusted is not None:
+        if any(p.status == "rejected" for p in adjusted.points):
+            # The blunders were in what the verdict looked at: what it says of the points in use counts.
+            again = [p for p in adjusted.points if p.status != "rejected"]
+            sound = _core.estimate_dlt(
+                np.stack([p.xyz for p in again]), np.stack([p.xy for p in again]), info.width, info.height,
+                distortion=list(options.distortion), check=np.array([p.role == "check" for p in again]),
+            )  # fmt: skip
+            warnings, trusted = tuple(w.message for w in sound.verdict.warnings), sound.verdict.ok
+        # Focal length and distance of a DLT always look alike; its own verdict names what matters.
+        warnings = (*warnings, *(w for w in adjusted.warnings if "correlated" not in w))
+    core = adjusted.core if adjusted else result.view
+    matrix = core.matrix() if adjusted else result.matrix
+    assert matrix is not None
     terms = dict(zip(("fx", "fy", "cx", "cy", *DLT_DISTORTION_NAMES), core.params.tolist(), strict=True))
     view = View(
         name=photo.stem,
         image=photo,
-        dlt=result.matrix,
+        dlt=matrix,
         dlt_distortion={name: terms[name] for name in options.distortion},
         size=(info.width, info.height),
-        covariance=_covariance(result),
+        covariance=adjusted.dlt_covariance if adjusted else _covariance(result),
         method="dlt",
-        points=_judged(control, result),
-        statistics=_statistics(result),
+        points=adjusted.points if adjusted else _judged(control, result),
+        statistics=adjusted.statistics if adjusted else _statistics(result),
     )
     parts = Covariance(tuple(result.part_parameters), result.part_covariance)
+    if adjusted:
+        parts = Covariance(adjusted.parameters, adjusted.covariance)
     figures = {**{name: terms[name] for name in ("fx", "fy", "cx", "cy")}, "skew": core.skew}
     return RegisterResult(
         registration=Registration((view,)),
         evaluation=evaluate_view(view),
-        notes=(f"DLT with {options.dlt_parameters} parameters; distortion: {', '.join(options.distortion) or 'none'}",),
-        warnings=tuple(w.message for w in result.verdict.warnings),
-        trusted=result.verdict.ok,
-        free=tuple(result.part_parameters),
+        notes=(
+            f"DLT with {options.dlt_parameters} parameters; distortion: {', '.join(options.distortion) or 'none'}",
+            sigmas.describe(),
+        ),
+        warnings=warnings,
+        trusted=trusted,
+        free=tuple(parts.parameters),
         facts={name: f"{value:.2f} ± {parts.sigma(name):.2f}" for name, value in figures.items()},
     )

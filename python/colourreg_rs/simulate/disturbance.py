@@ -82,7 +82,10 @@ class Disturbance:
             at = xy[i] + rng.normal(0.0, 1.0, 2) * self.point_sigma_xy
             if i in spoiled:
                 angle, size = rng.uniform(0, 2 * np.pi), rng.uniform(*self.blunder_size)
-                at = at + size * np.array([np.cos(angle), np.sin(angle)])
+                off = size * np.array([np.cos(angle), np.sin(angle)])
+                # Nobody points beside the photo.
+                limit = np.array([view.core.width, view.core.height]) - 0.5
+                at = at + np.where((at + off >= -0.5) & (at + off < limit), off, -off)
             role: Role = "check" if i in checks else "control"
             measured.append(
                 ControlPoint(

@@ -1,7 +1,7 @@
 """One measurement: every contender in a process of its own, in turn, so that all see the same machine.
 
 A contender is a function of this package that does its untimed preparation, then returns the seconds of the timed part.
-Its process's peak memory is what the operating system says of it.
+Its peak memory is that of its process alone.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
-import os
+import resource
 import statistics
 import subprocess
 import sys
@@ -26,20 +26,26 @@ class Figure:
     peak_mb: float
 
 
+def peak_of_this_process() -> float:
+    """MB. What the parent held before the start does not count, as it would in ``ru_maxrss``, where the system tells."""
+    try:
+        with open("/proc/self/status") as status:
+            return next(float(line.split()[1]) for line in status if line.startswith("VmHWM")) / 1024
+    except (OSError, StopIteration):
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
 def run_once(function: Callable[..., float], arguments: Sequence[str]) -> tuple[float, float]:
     """Seconds that the function returns, and the peak memory of its process in MB."""
     module = function.__module__
     if module == "__main__":  # the comparison itself is what was started
         module = str(getattr(sys.modules[module].__spec__, "name", module))
     command = [sys.executable, "-m", "benches.peers.harness", module, function.__name__, *arguments]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    output = process.stdout.read()
-    _, status, usage = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode != 0:
-        raise SystemExit(f"{function.__module__}.{function.__name__} ended with {process.returncode}")
-    return float(json.loads(output.splitlines()[-1])["seconds"]), usage.ru_maxrss / 1024
+    finished = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
+    if finished.returncode != 0:
+        raise SystemExit(f"{function.__module__}.{function.__name__} ended with {finished.returncode}")
+    figures = json.loads(finished.stdout.splitlines()[-1])
+    return float(figures["seconds"]), float(figures["peak_mb"])
 
 
 def compare(
@@ -65,7 +71,7 @@ def compare(
 def _child() -> None:
     module, name, *arguments = sys.argv[1:]
     seconds = getattr(importlib.import_module(module), name)(*arguments)
-    print(json.dumps({"seconds": seconds}))
+    print(json.dumps({"seconds": seconds, "peak_mb": peak_of_this_process()}))
 
 
 def parser(question: str) -> argparse.ArgumentParser:

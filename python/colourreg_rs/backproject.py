@@ -37,12 +37,23 @@ class BackprojectOptions:
     - ``radius``: points within it make a surface, px.
     - ``depth_sigma``: noise of the scanner along the ray, m.
     - ``pixel_sigma``: of a pixel's place by registration and photo, per axis, px.
+
+    Raises InvalidInputError.
     """
 
     extension: float = 0.0
     radius: float = 4.0
     depth_sigma: float = 0.003
     pixel_sigma: float = 0.5
+
+    def __post_init__(self) -> None:
+        limits = {"extension": (0.0, 1000.0, "px"), "radius": (1.5, 32.0, "px")}
+        limits |= {"depth_sigma": (0.0, np.inf, "m"), "pixel_sigma": (0.0, np.inf, "px")}
+        for name, (least, most, unit) in limits.items():
+            value = getattr(self, name)
+            if not (np.isfinite(value) and least <= value <= most):
+                allowed = f"{least:g} to {most:g} {unit}" if np.isfinite(most) else f"at least {least:g} {unit}"
+                raise InvalidInputError(f"{name.replace('_', ' ')} of {value:g} is not possible: {allowed}")
 
 
 @dataclass(frozen=True)
@@ -114,10 +125,13 @@ def backproject(
 
 def _colours(photo: npt.NDArray[Any], shape: tuple[int, int], pixels: npt.NDArray[np.int64]) -> npt.NDArray[np.uint16]:
     photo = photo[..., None] if photo.ndim == 2 else photo
-    if photo.shape[:2] != shape or photo.dtype not in (np.uint8, np.uint16):
+    if photo.shape[:2] != shape:
         raise InvalidInputError(
-            f"the photo is {photo.dtype} of shape {photo.shape}, the view's image {shape[1]} x {shape[0]} pixels"
+            f"the photo has {photo.shape[1]} x {photo.shape[0]} pixels, the view's camera {shape[1]} x {shape[0]}; "
+            f"give the photo that the view was registered with"
         )
+    if photo.dtype not in (np.uint8, np.uint16):
+        raise InvalidInputError(f"the photo's pixels are {photo.dtype}; they have to be uint8 or uint16")
     colours = photo[pixels[:, 1], pixels[:, 0]]
     colours = np.repeat(colours[:, :1], 3, 1) if colours.shape[1] < 3 else colours[:, :3]
     # As the LAS specification wants 8-bit values in 16 bits.
@@ -153,21 +167,32 @@ def backproject_file(
     Its attributes ``Origin`` (1 measured, 2 interpolated, 3 extended), ``Sigma`` (m, per axis) and ``View`` (from 1)
     say what each point is. Raises FileError.
     """
-    from .io.clouds import read_cloud, write_cloud
+    from .io.atomic import refuse_target
+    from .io.clouds import open_cloud, output_format, read_cloud, write_cloud
     from .io.images import read_photo
     from .io.registration import read_registration
     from .register import with_photo_sizes
 
     registration = with_photo_sizes(read_registration(registration_path), Path(registration_path))
-    cloud = read_cloud(cloud_path)
-    found, counts, sigma = [], {}, {}
+    photos = [view.image for view in registration.views]
     for view in registration.views:
         if view.image is None:
-            raise FileError(registration_path, f"view {view.name!r} names no photo")
+            raise FileError(registration_path, f"view {view.name!r} names no photo", "add `image`, for the colours")
+    # What cannot be written is said before the work, not after it.
+    out = Path(out)
+    refuse_target(out, (cloud_path, registration_path, *(p for p in photos if p is not None and p.exists())))
+    with open_cloud(cloud_path) as reader:
+        suffix = output_format(out, reader).lower()
+    out = out if out.suffix else out.with_suffix(f".{suffix}")
+    cloud = read_cloud(cloud_path)
+    found, counts, sigma = [], {}, {}
+    for view, path in zip(registration.views, photos, strict=True):
+        assert path is not None
+        photo = read_photo(path).pixels
         try:
-            found.append(backproject(cloud, view, read_photo(view.image).pixels, options=options))
+            found.append(backproject(cloud, view, photo, options=options))
         except InvalidInputError as error:
-            raise FileError(view.image, str(error)) from error
+            raise FileError(path, str(error)) from error
         if len(found[-1].cloud) == 0:
             raise FileError(registration_path, f"no pixel of view {view.name!r} sees the cloud", "look at its pose")
         counts[view.name] = found[-1].counts()
@@ -183,4 +208,4 @@ def backproject_file(
         "View": np.repeat(np.arange(1, len(found) + 1, dtype=np.uint16), [len(f.cloud) for f in found]),
     }
     write_cloud(out, joined, extra)
-    return BackprojectResult(Path(out), counts, sigma)
+    return BackprojectResult(out, counts, sigma)

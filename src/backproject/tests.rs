@@ -180,7 +180,8 @@ fn no_depth_is_made_across_an_edge() {
     for (near, far) in [(5.0, 10.0), (5.0, 5.5), (9.0, 9.4)] {
         let depth_at = step(&view.camera, 75.0, near, far);
         for hole in [0usize, 1, 2, 3, 4, 6] {
-            let keep = |x: usize, y: usize| (x + 1 < 75 || x >= 75 + hole) && (x * 5 + y * 11 + x * y) % 2 == 0;
+            let keep =
+                |x: usize, y: usize| (x + 1 < 75 || x >= 75 + hole) && (x * 5 + y * 11 + x * y).is_multiple_of(2);
             let (depth, measured) = render(&depth_at, keep);
             let options = BackprojectOptions { depth_sigma: 0.005, extension: 3.0, ..BackprojectOptions::default() };
             let (index, found) = backproject_image(&view, &image(&depth, &measured), &options).unwrap();

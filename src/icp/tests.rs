@@ -134,7 +134,7 @@ fn covariances_gate_by_mahalanobis_distance_and_weigh() {
     let (n, h) = (600, truth(Motion::Affine));
     let base = numbers.points(n);
     // Every other source point is uncertain in x, the others in y; the target is good throughout.
-    let sigma = |i: usize| if i % 2 == 0 { [4.0, 0.1] } else { [0.1, 4.0] };
+    let sigma = |i: usize| if i.is_multiple_of(2) { [4.0, 0.1] } else { [0.1, 4.0] };
     let draw = |(i, p): (usize, &[f64; 2])| {
         let [sx, sy] = sigma(i);
         [p[0] + sx * numbers.normal(), p[1] + sy * numbers.normal()]

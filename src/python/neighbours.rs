@@ -40,6 +40,7 @@ macro_rules! search {
     };
 }
 
+type Column<'py> = (Bound<'py, PyArray1<i64>>, Bound<'py, PyArray1<f64>>);
 type Rows<'py> = (Bound<'py, PyArray2<i64>>, Bound<'py, PyArray2<f64>>);
 type Lists<'py> = (Bound<'py, PyArray1<i64>>, Bound<'py, PyArray1<i64>>, Bound<'py, PyArray1<f64>>);
 
@@ -66,12 +67,7 @@ impl PyNeighbours {
     }
 
     #[pyo3(signature = (queries, max_distance=f64::INFINITY))]
-    fn nearest<'py>(
-        &self,
-        py: Python<'py>,
-        queries: &Bound<'py, PyAny>,
-        max_distance: f64,
-    ) -> PyResult<(Bound<'py, PyArray1<i64>>, Bound<'py, PyArray1<f64>>)> {
+    fn nearest<'py>(&self, py: Python<'py>, queries: &Bound<'py, PyAny>, max_distance: f64) -> PyResult<Column<'py>> {
         let (index, distance) = search!(self, py, queries, |index, rows| {
             index.nearest(rows, max_distance).map(|found| columns(&found))
         })?;

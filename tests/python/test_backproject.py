@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -15,12 +16,14 @@ from colourreg_rs.backproject import BackprojectOptions, Origin, backproject
 from colourreg_rs.io.clouds import open_cloud, read_cloud, write_cloud
 from colourreg_rs.io.images import write_png
 from colourreg_rs.io.registration import write_registration
+from colourreg_rs.simulate import simulate
 
 TERMS = {"k1": -0.12, "k2": 0.03, "p1": 1e-3, "p2": -5e-4}
 SIZE = {"cx": 118.0, "cy": 91.0}
 CAMERAS = {
     "PINHOLE": Camera("PINHOLE", 240, 180, {"fx": 220.0, "fy": 222.0, **SIZE}),
     "OPENCV": Camera("OPENCV", 240, 180, {"fx": 220.0, "fy": 222.0, **SIZE, **TERMS}),
+    "FULL_OPENCV": Camera("FULL_OPENCV", 240, 180, {"fx": 220.0, "fy": 222.0, **SIZE, **TERMS, "k4": 0.02}),
     "OPENCV_FISHEYE": Camera("OPENCV_FISHEYE", 240, 200, {"fx": 80.0, "fy": 80.0, "cx": 119.5, "cy": 99.5, "k1": 0.02}),
     "EQUIRECTANGULAR": Camera("EQUIRECTANGULAR", 240, 120),
 }
@@ -91,6 +94,58 @@ def test_a_dlt_is_inverted_by_its_metric_third_row_and_by_its_pseudo_inverse(rng
     some = np.column_stack([xy, np.ones(50)]) @ np.linalg.pinv(scaled).T
     homogeneous = some + np.outer(1 / depth - some[:, 3], [*view.pose.centre, 1.0])
     assert np.abs(homogeneous[:, :3] / homogeneous[:, 3:] - xyz).max() < 1e-9 * 8
+
+
+def as_dlt(view):
+    """The same projection as a matrix, of another scale and sign, with distortion terms."""
+    terms = {name: value for name, value in view.camera.params.items() if name in ("k1", "k2", "p1", "p2", "k3")}
+    return View("dlt", view.image, dlt=view.core.matrix() * -0.03, dlt_distortion=terms, size=view.image_size)
+
+
+@pytest.fixture(scope="module")
+def trial():
+    """A scan and a photo without any noise, and at each pixel's centre the distance and the primitive that it shows."""
+    simulation = simulate("trial", size=(480, 360), draft=True, samples=1, scanner=lambda s: s.without_noise())
+    photo = simulation.photos[0]
+    return simulation, photo, *photo.scene.depth_image(photo.view)
+
+
+@pytest.mark.parametrize("kind", ["camera", "dlt"])
+def test_a_simulation_without_noise_gives_back_its_surfaces(kind, trial):
+    """Against rays cast into the scene: on flat faces to 1e-9 of the distance and 1e-6 px, whatever the view is."""
+    simulation, photo, distance, primitive = trial
+    view = photo.view if kind == "camera" else as_dlt(photo.view)
+    result = backproject(simulation.scan, view, photo.image, options=BackprojectOptions(depth_sigma=1e-6))
+    column, row = result.pixels.T
+    # Far from any edge, so that the points about a pixel are of its own face.
+    flat = np.ones(primitive.shape, bool)
+    for dy, dx in np.ndindex(13, 13):
+        flat &= np.roll(primitive, (dy - 6, dx - 6), (0, 1)) == primitive
+    curved = [k for k, name in enumerate(photo.scene.objects) if name in ("ball", "tube")]
+    flat &= ~np.isin(photo.scene.object_of_primitive[primitive], curved) & (primitive >= 0)
+    inner = flat[row, column]
+    true = distance[row, column]
+    error = np.abs(np.linalg.norm(result.cloud.xyz - photo.view.pose.centre, axis=1) - true) / true
+    for origin in (Origin.MEASURED, Origin.INTERPOLATED):
+        chosen = inner & (result.origin == origin)
+        assert chosen.sum() > 10_000
+        assert error[chosen].max() < 1e-9
+    # The true view sees every point in the middle of its pixel.
+    assert np.abs(_core.project(photo.view.core, result.cloud.xyz)[0] - result.pixels).max() < 1e-6
+
+
+def test_nothing_floats_between_the_boxes_and_the_wall(trial):
+    """Interpolated points lie on what the scan met: none in the air between a near and a far surface."""
+    simulation, photo, distance, _ = trial
+    result = backproject(simulation.scan, photo.view, photo.image)
+    made = result.origin == Origin.INTERPOLATED
+    off = np.abs(np.linalg.norm(result.cloud.xyz - photo.view.pose.centre, axis=1) - distance[*result.pixels.T[::-1]])
+    nearest = _core.Neighbours(simulation.scan_truth.surface).nearest(np.ascontiguousarray(result.cloud.xyz))[1]
+    # 5 cm are far less than the depth of the edges, and ten times the spacing of the points.
+    assert made.sum() > 30_000
+    assert not (made & (off > 0.05) & (nearest > 0.05)).any()
+    # At the very silhouettes a pixel belongs to the one or the other.
+    assert (off[made] > 0.05).mean() < 2e-3
 
 
 def wall_cloud(rng, view, n=60_000, noise=0.0):
@@ -180,10 +235,14 @@ def test_a_surface_is_extended_beside_the_cloud_only_when_asked_for(rng):
 def test_what_does_not_fit_is_refused(rng):
     view = view_of("PINHOLE")
     cloud, _ = wall_cloud(rng, view, n=100)
-    with pytest.raises(InvalidInputError, match="photo is uint8 of shape"):
-        backproject(cloud, view, np.zeros((5, 5, 3), np.uint8))
-    with pytest.raises(InvalidInputError, match="extension"):
-        backproject(cloud, view, options=BackprojectOptions(extension=-1.0))
+    with pytest.raises(InvalidInputError, match="photo has 6 x 5 pixels, the view's camera 240 x 180"):
+        backproject(cloud, view, np.zeros((5, 6, 3), np.uint8))
+    with pytest.raises(InvalidInputError, match="uint8 or uint16"):
+        backproject(cloud, view, np.zeros((180, 240, 3), np.float32))
+    for options in ({"extension": -1.0}, {"radius": 0.0}, {"depth_sigma": np.nan}, {"pixel_sigma": np.inf}):
+        (name,) = options
+        with pytest.raises(InvalidInputError, match=name.replace("_", " ")):
+            BackprojectOptions(**options)
     with pytest.raises(ValueError, match=r"depth must be .* float32 array of shape \(180, 240\)"):
         _core.backproject_pixels(view.core, np.zeros((5, 5), np.float32), np.zeros((180, 240), bool))
 
@@ -219,5 +278,36 @@ def test_the_command_writes_a_coloured_cloud_that_says_what_each_point_is(suffix
     with open_cloud(out) as reader:
         names = {a.name for a in reader.attributes}
     assert {"Origin", "Sigma", "View"} <= names
-    run = command(tmp_path / "scan.laz", tmp_path / "none.json", tmp_path / "o.las")
-    assert run.returncode == 1 and run.stderr.count("\n") == 1 and "none.json" in run.stderr
+    dlt = as_dlt(named)
+    write_registration(tmp_path / "dlt.json", Registration((dlt,), cloud=tmp_path / "scan.laz"))
+    assert command(tmp_path / "scan.laz", tmp_path / "dlt.json", tmp_path / f"dlt{suffix}").returncode == 0
+    other = read_cloud(tmp_path / f"dlt{suffix}")
+    assert len(other) == len(backproject(cloud, view).cloud)
+    assert np.abs(_core.project(view.core, other.xyz)[0] - np.rint(_core.project(view.core, other.xyz)[0])).max() < 0.05
+
+
+def test_what_the_command_cannot_do_is_one_line_and_no_file(tmp_path, rng):
+    view = view_of("OPENCV")
+    cloud, _ = wall_cloud(rng, view, n=5000)
+    scan, photo, reg = tmp_path / "scan.laz", tmp_path / "photo.png", tmp_path / "reg.json"
+    write_cloud(scan, cloud)
+    write_png(photo, np.zeros((180, 240, 3), np.uint8))
+    named = View("photo", photo, view.camera, view.pose)
+    write_registration(reg, Registration((named,), cloud=scan))
+    away = view.pose.rotation * [[-1], [1], [-1]]
+    write_registration(tmp_path / "away.json", Registration((replace(named, pose=Pose(away, np.zeros(3))),)))
+    write_registration(tmp_path / "bare.json", Registration((replace(named, image=None),)))
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    for cloud_path, registration, out, words in [
+        (scan, tmp_path / "none.json", "o.las", "none.json"),
+        (tmp_path / "none.laz", reg, "o.las", "none.laz"),
+        (scan, reg, "o.xyz", "XYZ is not written"),
+        (scan, reg, "folder/o.las", "does not exist; create it first"),
+        (scan, reg, "scan.laz", "is the input file itself"),
+        (scan, reg, "photo.png", "is the input file itself"),
+        (scan, tmp_path / "away.json", "o.las", "no pixel of view 'photo' sees the cloud"),
+        (scan, tmp_path / "bare.json", "o.las", "image"),
+    ]:
+        run = command(cloud_path, registration, tmp_path / out)
+        assert run.returncode == 1 and run.stderr.count("\n") == 1 and words in run.stderr, run.stderr
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before

@@ -15,6 +15,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 
 @dataclass(frozen=True)
@@ -27,9 +28,9 @@ class Figure:
 
 
 def peak_of_this_process() -> float:
-    """MB. What the parent held before the start does not count, as it would in ``ru_maxrss``, where the system tells."""
+    """MB. What the parent held before the start does not count, as it does in ``ru_maxrss``, where the system tells."""
     try:
-        with open("/proc/self/status") as status:
+        with Path("/proc/self/status").open() as status:
             return next(float(line.split()[1]) for line in status if line.startswith("VmHWM")) / 1024
     except (OSError, StopIteration):
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

@@ -1,11 +1,11 @@
 """How fast, and how accurate, is resection with a calibrated camera beside OpenCV, pycolmap and PoseLib?
 
-All get the same control points in turn in one process: a photo of 6000 × 4000 px with OpenCV's distortion, points 10 to
-40 m away, 0.5 px of noise, and, for the robust ones, blunders anywhere in the photo. The median of several scenes counts;
-what is compared with the truth is the projection centre. Limits: pycolmap and PoseLib estimate robustly always; a threshold
-of 4 px is given to all that take one; USAC answers without a last refinement, which is its way of being fast. Points that
-a program cannot work with at map coordinates are still given to it: that is what its users do. OpenCV's iterative search
-needs a start and gets its own (SQPNP).
+All get the same control points in turn in one process: a photo of 6000 × 4000 px with OpenCV's distortion, points 10
+to 40 m away, 0.5 px of noise, and, for the robust ones, blunders anywhere in the photo. The median of several scenes
+counts; what is compared with the truth is the projection centre. Limits: pycolmap and PoseLib estimate robustly always;
+a threshold of 4 px is given to all that take one; USAC answers without a last refinement, which is its way of being
+fast. Points that a program cannot work with at map coordinates are still given to it: that is what its users do.
+OpenCV's iterative search needs a start and gets its own (SQPNP).
 
     python -m benches.peers.resection [--repeats 5]
 """
@@ -98,7 +98,10 @@ def pycolmap(t: Task) -> np.ndarray:
 
     # COLMAP's pixels begin at the corner, not at the centre, of the first one.
     camera = colmap.Camera(
-        model="FULL_OPENCV", width=6000, height=4000, params=[*(PARAMS[:4] + [0, 0, 0.5, 0.5]), *PARAMS[4:], 0, 0, 0]
+        model="FULL_OPENCV",
+        width=6000,
+        height=4000,
+        params=[*(PARAMS[:4] + np.array([0, 0, 0.5, 0.5])), *PARAMS[4:], 0, 0, 0],
     )
     options = colmap.AbsolutePoseEstimationOptions()
     options.ransac.max_error, options.ransac.confidence = THRESHOLD, 0.9999

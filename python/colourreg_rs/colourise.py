@@ -8,6 +8,7 @@ the size of the chunks nor on the number of threads.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -18,7 +19,7 @@ import numpy.typing as npt
 from . import _core
 from .errors import FileError, InvalidInputError
 from .io.clouds import CloudChunk, CloudReader, CloudWriter, create_cloud, open_cloud
-from .io.images import Photo, read_photo
+from .io.images import photo_info, read_photo
 from .io.registration import read_registration
 from .model import FloatArray, View
 from .overlap import Behind, prefetched
@@ -109,19 +110,17 @@ class SigmaHistogram:
 
 
 class Colouriser:
-    """Two passes: :meth:`see` every chunk, then :meth:`finish`, then :meth:`colour` every chunk.
+    """Two passes: :meth:`see` every chunk, then :meth:`finish` with the photos, then :meth:`colour` every chunk.
 
     With ``level_exposure``, :meth:`compare` every chunk between :meth:`finish` and :meth:`colour`.
     """
 
-    def __init__(
-        self, views: Sequence[View], photos: Sequence[npt.NDArray[Any]], options: ColouriseOptions | None = None
-    ) -> None:
+    def __init__(self, views: Sequence[View], options: ColouriseOptions | None = None) -> None:
         if not views:
             raise InvalidInputError("there is no view to colour from")
         self.views = tuple(views)
         self.options = options or ColouriseOptions()
-        self._photos = [np.ascontiguousarray(photo) for photo in photos]
+        self._photos: list[npt.NDArray[Any]] = []
         self._buffers = [_core.DepthBuffer(view.core, max_distance=self.options.max_distance) for view in self.views]
         self._maps: list[_core.VisibilityMap] = []
         self._exposure = _core.Exposure(len(self.views)) if self.levels else None
@@ -138,10 +137,17 @@ class Colouriser:
         for buffer in self._buffers:
             buffer.add(xyz)
 
-    def finish(self) -> None:
-        """Between the passes: surfaces are made of the points that were seen."""
+    def finish(self, photos: Sequence[npt.NDArray[Any]]) -> None:
+        """Between the passes: surfaces are made of the points that were seen.
+
+        Args:
+            photos: (H, W, 3) uint8 or uint16, those of the views, in their order.
+        """
+        if len(photos) != len(self.views):
+            raise InvalidInputError(f"{len(photos)} photos for {len(self.views)} views")
         self._maps = [buffer.finish() for buffer in self._buffers]
         self._buffers = []
+        self._photos = [np.ascontiguousarray(photo) for photo in photos]
 
     def compare(self, xyz: FloatArray) -> None:
         """What several photos see of the chunk tells how their exposures differ."""
@@ -174,14 +180,14 @@ def _surface_sigma(view: View, options: ColouriseOptions) -> _core.SurfaceSigma 
     return _core.SurfaceSigma(view.core, names, matrix, sigma_image=options.sigma_image, sigma_xyz=options.sigma_xyz)
 
 
-def load_views(paths: Sequence[Path]) -> tuple[list[View], list[Photo]]:
-    """All views of all registrations with their photos, in order. Raises FileError."""
-    views, photos = [], []
+def load_views(paths: Sequence[Path]) -> list[View]:
+    """All views of all registrations, in order, whose photos exist and have the size that is told. Raises FileError."""
+    views = []
     for path in paths:
         for view in read_registration(path).views:
             if view.image is None:
                 raise FileError(path, f"view {view.name!r} names no photo", "give its image")
-            photo = read_photo(view.image)
+            photo = photo_info(view.image)
             size = (photo.width, photo.height)
             if view.image_size is not None and view.image_size != size:
                 wanted = "{} x {}".format(*view.image_size)
@@ -191,8 +197,12 @@ def load_views(paths: Sequence[Path]) -> tuple[list[View], list[Photo]]:
                     "use the photo that was registered, not a scaled or turned copy",
                 )
             views.append(view if view.image_size else replace(view, size=size))
-            photos.append(photo)
-    return views, photos
+    return views
+
+
+def _pixels(view: View) -> npt.NDArray[Any]:
+    assert view.image is not None
+    return read_photo(view.image).pixels
 
 
 def colourise_file(
@@ -211,9 +221,16 @@ def colourise_file(
     options = options or ColouriseOptions()
     cloud, out = Path(cloud), Path(out)
     with open_cloud(cloud) as reader, create_cloud(out, like=reader) as writer:
-        views, photos = load_views([Path(path) for path in registrations])
-        colouriser = Colouriser(views, [photo.pixels for photo in photos], options)
-        low, high = _first_pass(reader, colouriser, progress)
+        views = load_views([Path(path) for path in registrations])
+        colouriser = Colouriser(views, options)
+        # The first pass needs no photo: they are decoded behind it.
+        with ThreadPoolExecutor(1, thread_name_prefix="colourreg-photos") as decoder:
+            photos = [decoder.submit(_pixels, view) for view in views]
+            try:
+                low, high = _first_pass(reader, colouriser, photos, progress)
+            except BaseException:
+                decoder.shutdown(wait=False, cancel_futures=True)
+                raise
         coloured, counts, sigmas = _second_pass(reader, writer, colouriser, progress)
         if coloured == 0:
             raise FileError(cloud, _nothing_seen(views, low, high), "check the registration's frame and unit")
@@ -237,7 +254,9 @@ def _positions(reader: CloudReader, options: ColouriseOptions) -> Iterator[Cloud
     return prefetched(reader.chunks(options.chunk_size, positions_only=True))
 
 
-def _first_pass(reader: CloudReader, colouriser: Colouriser, progress: Progress) -> tuple[FloatArray, FloatArray]:
+def _first_pass(
+    reader: CloudReader, colouriser: Colouriser, photos: Sequence[Future[npt.NDArray[Any]]], progress: Progress
+) -> tuple[FloatArray, FloatArray]:
     """Fills and finishes the buffers; gives the cloud's extent."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     total = reader.n_points
@@ -245,7 +264,7 @@ def _first_pass(reader: CloudReader, colouriser: Colouriser, progress: Progress)
         colouriser.see(chunk.xyz)
         low, high = np.fmin(low, np.fmin.reduce(chunk.xyz)), np.fmax(high, np.fmax.reduce(chunk.xyz))
         progress("finding what hides what", chunk.start + len(chunk), total)
-    colouriser.finish()
+    colouriser.finish([photo.result() for photo in photos])
     if colouriser.levels:
         for chunk in _positions(reader, colouriser.options):
             colouriser.compare(chunk.xyz)

@@ -23,9 +23,9 @@ def setup(rng):
 
 
 def coloured(views, points, photo, **options):
-    colouriser = Colouriser(views, [photo] * len(views), ColouriseOptions(**options))
+    colouriser = Colouriser(views, ColouriseOptions(**options))
     colouriser.see(points)
-    colouriser.finish()
+    colouriser.finish([photo] * len(views))
     return colouriser.colour(points)
 
 

@@ -1,7 +1,7 @@
 """Does the memory for colouring a file grow with the cloud? Peak memory at 20 and at 60 million points.
 
-Limits: the same street and photo of 24 megapixels as in the comparison of files, LAZ to LAZ. Memory should be that of the
-photo (72 MB), its depth buffer and some chunks; laspy alone, chunk by chunk, is the measure of what chunks cost.
+Limits: the same street and photo of 24 megapixels as in the comparison of files, LAZ to LAZ. Memory should be that of
+the photo (72 MB), its depth buffer and some chunks; laspy alone, chunk by chunk, is the measure of what chunks cost.
 
     python -m benches.peers.memory [--points 20000000 60000000]
 """

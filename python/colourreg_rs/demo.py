@@ -12,15 +12,17 @@ import numpy.typing as npt
 
 from . import _core
 from .colourise import ColouriseResult, colourise_file
+from .correspondences import supported_scale
 from .io.atomic import write_text
 from .io.clouds import open_cloud, read_cloud, write_cloud
 from .io.images import read_photo, write_image
 from .io.points import write_points
 from .io.registration import read_registration, write_camera, write_registration
-from .model import FloatArray, Registration, View
+from .model import FloatArray, PointCloud, Registration, View
 from .pictures import bird_view, draw_cloud, overlay
 from .progress import Progress, silent
 from .register import RegisterOptions, register_photo
+from .sci import render_sci, with_size
 from .simulate import Disturbance, SimulatedPhoto, Simulation, simulate
 
 IntArray = npt.NDArray[np.int64]
@@ -125,11 +127,10 @@ def run_demo(folder: Path, *, seed: int = 0, progress: Progress = silent) -> Dem
     views = [read_registration(path).views[0] for path in registrations]
     progress("demo: comparing with the truth", 4, steps)
     coloured = read_cloud(out)
-    assert coloured.rgb is not None
     colours = _colour_truth(simulation, out, chosen)
     truths = tuple(_view_truth(simulation, p, v, chosen) for p, v in zip(simulation.photos, views, strict=True))
     progress("demo: drawing", 5, steps)
-    pictures = _draw(folder, simulation, views, coloured.xyz, coloured.rgb)
+    pictures = _draw(folder, coloured, views, np.array(simulation.stations[0]))
     progress("demo: done", steps, steps)
     return DemoResult(folder, len(simulation.scan), truths, colours, result, pictures)
 
@@ -198,14 +199,21 @@ def _colour_truth(simulation: Simulation, coloured: Path, chosen: IntArray) -> C
     )
 
 
-def _draw(folder: Path, simulation: Simulation, views: list[View], xyz: FloatArray, rgb: Any) -> tuple[str, ...]:
-    names = []
+def _draw(folder: Path, coloured: PointCloud, views: list[View], station: FloatArray) -> tuple[str, ...]:
+    xyz, rgb = coloured.xyz, coloured.rgb
+    assert rgb is not None
+    pictures = {}
     for view in views:
-        assert view.image is not None
-        name = f"{view.name}-overlay.png"
-        write_image(folder / name, overlay(read_photo(view.image).pixels, view, xyz))
-        names.append(name)
+        assert view.image is not None and view.image_size is not None
+        # As large as the scan is dense, so that the SCI has no more filled pixels than measured ones.
+        scale = supported_scale(coloured, view)
+        width, height = (round(side * scale) for side in view.image_size)
+        pictures[f"{view.name}-sci.png"] = render_sci(
+            coloured, with_size(view, width, height), station=station
+        ).intensity
+        pictures[f"{view.name}-overlay.png"] = overlay(read_photo(view.image).pixels, view, xyz)
     for name, view in (("coloured-front.png", views[0]), ("coloured-above.png", bird_view(xyz, views[0]))):
-        write_image(folder / name, draw_cloud(xyz, rgb, view))
-        names.append(name)
-    return tuple(names)
+        pictures[name] = draw_cloud(xyz, rgb, view)
+    for name, picture in pictures.items():
+        write_image(folder / name, picture)
+    return tuple(pictures)

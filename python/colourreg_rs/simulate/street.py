@@ -110,6 +110,9 @@ def kiosk(b: Builder, origin: tuple[float, float, float], yaw: float, rng: np.ra
     sign = Material((materials.fill(colour("#333333", 0.4)), materials.painted(board, 0, 0, w + 0.5, 0.4)))
     k.box((-0.25, -0.5, h + 0.1), (w + 0.25, d + 0.25, h + 0.5), materials.plain(base, rng), open_faces=("-y",))
     k.rectangle((-0.25, -0.5, h + 0.1), (w + 0.5, 0, 0), (0, 0, 0.4), sign)
+    for name, x, z, out in (("foot", 0.0, 0.0, 0.0), ("counter", 0.2, 1.0, 0.25), ("sign", -0.25, h + 0.5, 0.5)):
+        k.mark(f"kiosk {name} left", (x, -out, z))
+        k.mark(f"kiosk {name} right", (w - x, -out, z))
     side = k.place((w, 0, 0), np.pi / 2)
     side.named("kiosk")
     poster_board(side, (0.25, -0.01, 0.7), 0.62, 0.88, rng)
@@ -128,6 +131,8 @@ def colonnade(b: Builder, origin: tuple[float, float, float], yaw: float, count:
     for i in range(count):
         x = i * pitch
         c.box((x - 1.5 * radius, -1.5 * radius, 0), (x + 1.5 * radius, 1.5 * radius, 0.16), marble, open_faces=("-z",))
+        c.mark(f"column {i} foot left", (x - 1.5 * radius, -1.5 * radius, 0.16))
+        c.mark(f"column {i} foot right", (x + 1.5 * radius, -1.5 * radius, 0.16))
         c.column((x, 0, 0.16), (0, 0, 0.12), 1.32 * radius, marble)
         c.disc((x, 0, 0.28), (0, 0, 1), 1.32 * radius, marble)
         c.column((x, 0, 0.28), (0, 0, height - 0.4), radius, marble, top_radius=0.84 * radius)
@@ -146,6 +151,8 @@ def bench(b: Builder, origin: tuple[float, float, float], yaw: float, rng: np.ra
     iron = materials.metal(rng, "#26292b", 0.15)
     for i in range(4):
         c.box((0, 0.11 * i, 0.43), (1.7, 0.11 * i + 0.08, 0.465), slat)
+    c.mark("bench left", (0, 0, 0.465))
+    c.mark("bench right", (1.7, 0, 0.465))
     for i in range(3):
         c.box((0, 0.46 + 0.03 * i, 0.55 + 0.13 * i), (1.7, 0.49 + 0.03 * i, 0.64 + 0.13 * i), slat)
     for x in (0.15, 1.5):

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .. import buildings, plants, street
+from .. import buildings, plants, street, targets
 from ..builder import Builder
 from ..layout import Layout, Viewpoint, lens
 from ..lighting import daylight
@@ -42,6 +42,9 @@ def _square(rng: np.random.Generator, points: float, photos: int) -> Layout:
     street.planter(b, (float(rng.uniform(-1.5, -0.6)), -1.2, 0), rng)
     street.planter(b, (float(rng.uniform(4.2, 5.0)), -1.2, 0), rng)
     street.background(b, rng, y=-38.0)
+    # Walls alone would leave the ground to extrapolation: plates lie on it, as surveyors lay them.
+    for i, (x, y) in enumerate(((-3.5, -10.5), (4.0, -11.0), (0.5, -6.0), (7.5, -9.0))):
+        targets.quartered(b.named("target"), f"ground {i}", (x, y, 0.004), 0.3, upward=(0, 1, 0))
     station = (float(rng.uniform(0.8, 2.2)), float(rng.uniform(-18.5, -16.0)), 1.75)
     viewpoints = []
     for i in range(photos):

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from . import __version__
-from .errors import ColourregError, FileError, InvalidInputError
+from .errors import ColourregError
 from .progress import terminal_bars
+
+if TYPE_CHECKING:
+    from .model import ControlPoint, Registration
 
 app = typer.Typer(
     name="colourreg",
@@ -22,6 +26,7 @@ app = typer.Typer(
     add_completion=False,
 )
 
+ReportOption = Annotated[Path | None, typer.Option(metavar="FILE", help="Write a report for people (HTML).")]
 JsonOption = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the result for machines.")]
 
 
@@ -226,6 +231,7 @@ def register(
     ] = "",
     dlt_parameters: Annotated[int, typer.Option(help="11 (h34 = 1, iterated) or 12 (singular values).")] = 11,
     seed: Annotated[int, typer.Option(help="Of the search for blunders.")] = 0,
+    report: ReportOption = None,
     json_file: JsonOption = None,
 ) -> None:
     """Estimates from where, and with what camera, a photo was taken."""
@@ -247,6 +253,8 @@ def register(
     print(result.text())
     print(f"wrote {out}")
     _write_json(json_file, result.as_dict())
+    if report is not None:
+        _evaluate(result.registration, out, None, cloud, report, None, quiet=True)
 
 
 @app.command()
@@ -289,22 +297,46 @@ def evaluate(
     points: Annotated[
         Path | None, typer.Option(help="More points (CSV); those that took no part are check points.")
     ] = None,
+    cloud: Annotated[
+        Path | None, typer.Option(help="The laser scan: compares it with the photos, and maps ColourSigma.")
+    ] = None,
+    report: ReportOption = None,
     json_file: JsonOption = None,
 ) -> None:
-    """How accurate a registration is: RMS in pixels, and in metres at the object."""
-    from .evaluate import evaluate as evaluate_registration
-    from .evaluate import table
+    """How accurate a registration is: in pixels, millimetres and milliradians, with tests and advice."""
     from .io.points import read_points
     from .io.registration import read_registration
     from .register import with_photo_sizes
 
     views = with_photo_sizes(read_registration(registration), registration)
-    try:
-        result = evaluate_registration(views, read_points(points) if points else None)
-    except InvalidInputError as error:
-        raise FileError(registration, str(error)) from error
-    print(table(result))
-    _write_json(json_file, [e.as_dict() for e in result])
+    _evaluate(views, registration, read_points(points) if points else None, cloud, report, json_file)
+
+
+def _evaluate(
+    views: Registration,
+    path: Path,
+    points: Sequence[ControlPoint] | None,
+    cloud: Path | None,
+    report: Path | None,
+    json_file: Path | None,
+    quiet: bool = False,
+) -> None:
+    """Assesses, prints (unless ``quiet``), and writes what was asked for."""
+    from .advice import advice
+    from .assessment_run import assess_registration, text_of
+
+    with terminal_bars() as progress:
+        assessed, photos = assess_registration(
+            views, path, points, cloud, pictures=report is not None, progress=progress
+        )
+    if not quiet:
+        print(text_of(assessed))
+    if report is not None:
+        from .report import write_report
+
+        write_report(report, assessed, photos, title=path.stem, cloud=cloud.name if cloud else None)
+        print(f"wrote {report}")
+    _write_json(json_file, [a.as_dict() | {"advice": list(advice(a))} for a in assessed])
 
 
 @app.command()

@@ -17,8 +17,9 @@ from .model import ControlPoint, FloatArray, Registration, View
 class PointError:
     """What a view makes of one point.
 
-    ``residual_xy``: computed minus measured position, pixels. ``offset_xyz``: at the depth of the point, the place that
-    the measured pixel stands for minus the point's own, world frame, metres; NaN where the view cannot see the point.
+    ``residual_xy``: computed minus measured position ``xy``, pixels. ``offset_xyz``: at the depth of the point, the
+    place that the measured pixel stands for minus the point's own, world frame, metres; NaN where the view cannot see
+    the point.
     """
 
     name: str
@@ -27,6 +28,7 @@ class PointError:
     residual_xy: FloatArray
     offset_xyz: FloatArray
     depth: float
+    xy: FloatArray | None = None
 
 
 @dataclass(frozen=True)
@@ -127,7 +129,9 @@ def point_errors(view: View, points: Sequence[ControlPoint]) -> list[PointError]
     scale = depth / (rays @ view.core.rotation[2] if along_axis else 1.0)
     offsets = rays * scale[:, None] - (xyz - centre)
     return [
-        PointError(p.name, p.role, p.status or "used", computed[i] - measured[i], offsets[i], float(depth[i]))
+        PointError(
+            p.name, p.role, p.status or "used", computed[i] - measured[i], offsets[i], float(depth[i]), measured[i]
+        )
         for i, p in enumerate(points)
     ]
 

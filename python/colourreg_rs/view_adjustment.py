@@ -72,12 +72,12 @@ class PointSigmas:
         """(N, 3, 3)"""
         return np.ascontiguousarray(self.space[:, :, None] ** 2 * np.eye(3))
 
-    def seen_from(self, view: _core.View, xyz: FloatArray) -> FloatArray:
+    def seen_from(self, view: _core.View, xyz: FloatArray, rows: Any = slice(None)) -> FloatArray:
         """Covariances (N, 2, 2) of misclosures in the photo: its own, and that of the object as the view sees it."""
         _, by_point, _, _ = _core.project_jacobians(view, xyz)
         by_point = np.where(np.isfinite(by_point), by_point, 0.0)
         return np.ascontiguousarray(
-            self.covariance_xy + np.einsum("nij,njk,nlk->nil", by_point, self.covariance_xyz, by_point)
+            self.covariance_xy[rows] + np.einsum("nij,njk,nlk->nil", by_point, self.covariance_xyz[rows], by_point)
         )
 
     def with_photo_from(self, residuals: FloatArray, used: Any, parameters: int, seen: FloatArray) -> PointSigmas:
@@ -229,16 +229,23 @@ def _statistics(
         "smallest_eigenvalue": s["smallest_eigenvalue"],
         "parameters": list(result.names),
         "correlations": plain(s["correlations"]),
-        "points": _point_rows(points, judged, rows, s),
+        "points": _point_rows(result, points, judged, rows, s, sigmas),
         **_checks(result, judged, sigmas, s),
     }  # fmt: skip
     return figures
 
 
 def _point_rows(
-    points: Sequence[ControlPoint], judged: Sequence[ControlPoint], rows: Any, s: Mapping[str, Any]
+    result: _core.Adjustment,
+    points: Sequence[ControlPoint],
+    judged: Sequence[ControlPoint],
+    rows: Any,
+    s: Mapping[str, Any],
+    sigmas: PointSigmas,
 ) -> list[dict[str, Any]]:
     """What the tests say about each control point that came into the adjustment."""
+    # Cov(w) = W Cov(d)⁻¹ W of residuals w and those without the point, d; W is the misclosures' own.
+    seen = s["scale"] * sigmas.seen_from(result.view, np.stack([points[i].xyz for i in rows]), rows)
     said = []
     for k, i in enumerate(rows.tolist()):
         said.append(
@@ -249,6 +256,7 @@ def _point_rows(
                 "statistic": plain(s["statistic"][k]),
                 "p_value": plain(s["p_value"][k]),
                 "corrections": plain(s["corrections"][k]),
+                "residual_covariance": plain(_of_residual(seen[k], s["deleted_covariance"][k], s["used"][k])),
                 "leave_one_out": plain(s["deleted"][k]),
                 "leave_one_out_covariance": plain(s["deleted_covariance"][k]),
                 "detectable": plain(s["detectable"][k]),
@@ -259,6 +267,12 @@ def _point_rows(
             }
         )
     return said
+
+
+def _of_residual(own: FloatArray, deleted: FloatArray, used: bool) -> FloatArray:
+    if not used or not np.isfinite(deleted).all():
+        return deleted
+    return np.asarray(own @ np.linalg.solve(deleted, own))
 
 
 def _checks(

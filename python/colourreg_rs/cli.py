@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from . import __version__
-from .errors import ColourregError
+from .errors import ColourregError, FileError
 from .progress import terminal_bars
 
 if TYPE_CHECKING:
@@ -232,6 +232,9 @@ def register(
     dlt_parameters: Annotated[int, typer.Option(help="11 (h34 = 1, iterated) or 12 (singular values).")] = 11,
     seed: Annotated[int, typer.Option(help="Of the search for blunders.")] = 0,
     report: ReportOption = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Write the registration even where it is not to be trusted.")
+    ] = False,
     json_file: JsonOption = None,
 ) -> None:
     """Estimates from where, and with what camera, a photo was taken."""
@@ -249,12 +252,18 @@ def register(
         seed=seed,
     )
     result = register_photo(cloud, photo, points=points, init=init, camera=camera, options=chosen)
-    result.save(out)
     print(result.text())
-    print(f"wrote {out}")
     _write_json(json_file, result.as_dict())
-    if report is not None:
+    if report is not None:  # a view that is not to be trusted needs looking at most
         _evaluate(result.registration, out, None, cloud, report, None, quiet=True)
+    if result.doubts and not force:
+        raise FileError(
+            photo,
+            f"no view that can be trusted: {'; '.join(result.doubts)}",
+            "no registration was written; mend the points, or keep the view all the same with --force",
+        )
+    result.save(out)
+    print(f"wrote {out}")
 
 
 @app.command()

@@ -240,8 +240,14 @@ def colourise_file(
         coloured=coloured,
         by_view={f"{i}: {view.name}": int(n) for i, (view, n) in enumerate(zip(views, counts, strict=True), start=1)},
         median_sigma=sigmas,
-        warnings=writer.warnings,
+        warnings=(*_doubts(views), *writer.warnings),
     )
+
+
+def _doubts(views: Sequence[View]) -> tuple[str, ...]:
+    """What was said against the views when they were registered, and written all the same."""
+    said = ((view.name, doubt) for view in views for doubt in view.statistics.get("doubts") or ())
+    return tuple(f"view {name} was registered with a doubt: {doubt}" for name, doubt in said)
 
 
 def _nothing_seen(views: Sequence[View], low: FloatArray, high: FloatArray) -> str:

@@ -15,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from . import _core
+from .doubts import contradictions
 from .errors import DegenerateError, FileError, InvalidInputError, NotConvergedError
 from .evaluate import ViewEvaluation, evaluate_view, table
 from .io.clouds import open_cloud
@@ -50,6 +51,8 @@ class RegisterOptions:
         for name, value in (("sigma", self.sigma_xy), ("sigma-xyz", self.sigma_xyz)):
             if value is not None and not (np.isfinite(value) and value >= 0):
                 raise InvalidInputError(f"--{name} {value} is not possible: give a positive number")
+        for text in self.priors:
+            parse_prior(text)
 
 
 @dataclass(frozen=True)
@@ -60,9 +63,14 @@ class RegisterResult:
     evaluation: ViewEvaluation
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
-    trusted: bool = True
+    doubts: tuple[str, ...] = ()
     free: tuple[str, ...] = ()
     facts: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def trusted(self) -> bool:
+        """Whether nothing speaks against using the view. ``doubts`` says what does; ``warnings`` are to be read too."""
+        return not self.doubts
 
     @property
     def view(self) -> View:
@@ -90,8 +98,9 @@ class RegisterResult:
             lines.append("camera " + "  ".join(f"{k} {v:.6g}" for k, v in view.camera.params.items()))
         lines += [f"{key}: {value}" for key, value in self.facts.items()]
         lines += [f"warning: {warning}" for warning in self.warnings]
-        if not self.trusted:
-            lines.append("VERDICT: do not use this view before somebody has looked at it (see the warnings)")
+        lines += [f"DOUBT: {doubt}" for doubt in self.doubts]
+        if self.doubts:
+            lines.append("VERDICT: do not use this view before somebody has looked at it")
         return "\n".join(lines)
 
     def as_dict(self) -> dict[str, Any]:
@@ -99,6 +108,7 @@ class RegisterResult:
         view = self.view
         return {
             "trusted": self.trusted,
+            "doubts": list(self.doubts),
             "warnings": list(self.warnings),
             "notes": list(self.notes),
             "free": list(self.free),
@@ -177,7 +187,10 @@ def register_photo(
             result = _by_resection(photo, control, start, options)
     except (DegenerateError, InvalidInputError) as error:
         raise FileError(points, str(error)) from error
-    registration = Registration((result.view,), cloud, crs_wkt)
+    view = result.view
+    if result.doubts:  # whoever uses the file must hear of them
+        view = replace(view, statistics={**view.statistics, "doubts": list(result.doubts)})
+    registration = Registration((view,), cloud, crs_wkt)
     return replace(
         result,
         registration=registration,
@@ -285,7 +298,8 @@ def _by_resection(
     priors = [parse_prior(text) for text in options.priors]
     sigmas = PointSigmas.of(control, options.sigma_xy, options.sigma_xyz)
     rough, sigmas = _approximate(given, control, sigmas, start, free, priors, options)
-    warnings = tuple(w.message for w in rough.verdict.warnings)
+    warnings = tuple(w.message for w in rough.verdict.warnings if not w.fatal)
+    doubts = tuple(w.message for w in rough.verdict.warnings if w.fatal)
     errors = rough.centre_error, rough.border_error
     adjusted = None
     if options.loss is None:
@@ -296,11 +310,11 @@ def _by_resection(
         try:
             adjusted = adjust_control(rough.view, control, rough.status, sigmas, names, priors=soft)
         except (DegenerateError, NotConvergedError) as error:
-            warnings = (*warnings, f"not adjusted, statistics of the points are missing: {error}")
+            doubts = (*doubts, f"the points could not be adjusted, so that nothing tests them: {error}")
     if adjusted is not None:
         # What the adjustment says again, and better.
         repeated = {"correlation", "variance_factor"}
-        kept = [w.message for w in rough.verdict.warnings if w.code not in repeated or w.fatal]
+        kept = [w.message for w in rough.verdict.warnings if w.code not in repeated and not w.fatal]
         warnings = (*kept, *adjusted.warnings)
         errors = _predicted_errors(adjusted, control)
     core = adjusted.core if adjusted else rough.view
@@ -320,7 +334,7 @@ def _by_resection(
         evaluation=evaluate_view(view),
         notes=(f"{start.origin}; free: {', '.join(free)}", sigmas.describe()),
         warnings=warnings,
-        trusted=rough.verdict.ok and (adjusted is not None or options.loss is not None),
+        doubts=(*doubts, *contradictions(view)),
         free=tuple(free),
         facts={"error_in_the_middle_px": round(errors[0], 3), "error_at_the_border_px": round(errors[1], 3)},
     )
@@ -438,22 +452,23 @@ def _by_dlt(photo: Path, info: PhotoInfo, control: Sequence[ControlPoint], optio
         sigma_xy=sigmas.covariance_xy if sigmas.photo_known else None,
         check=np.array([p.role == "check" for p in control]),
     )
-    warnings = tuple(w.message for w in result.verdict.warnings)
-    trusted, adjusted = result.verdict.ok, None
+    verdict, adjusted = result.verdict, None
+    unadjusted: tuple[str, ...] = ()
     if options.dlt_parameters == 11:
         try:
             adjusted = adjust_control(result.view, control, result.status, sigmas, options.distortion, dlt=True)
         except (DegenerateError, NotConvergedError) as error:
-            warnings = (*warnings, f"not adjusted, statistics of the points are missing: {error}")
+            unadjusted = (f"the points could not be adjusted, so that nothing tests them: {error}",)
+    if adjusted is not None and any(p.status == "rejected" for p in adjusted.points):
+        # The blunders were in what the verdict looked at: what it says of the points in use counts.
+        again = [p for p in adjusted.points if p.status != "rejected"]
+        sound = _core.estimate_dlt(
+            np.stack([p.xyz for p in again]), np.stack([p.xy for p in again]), info.width, info.height,
+            distortion=list(options.distortion), check=np.array([p.role == "check" for p in again]),
+        )  # fmt: skip
+        verdict = sound.verdict
+    warnings = tuple(w.message for w in verdict.warnings if not w.fatal)
     if adjusted is not None:
-        if any(p.status == "rejected" for p in adjusted.points):
-            # The blunders were in what the verdict looked at: what it says of the points in use counts.
-            again = [p for p in adjusted.points if p.status != "rejected"]
-            sound = _core.estimate_dlt(
-                np.stack([p.xyz for p in again]), np.stack([p.xy for p in again]), info.width, info.height,
-                distortion=list(options.distortion), check=np.array([p.role == "check" for p in again]),
-            )  # fmt: skip
-            warnings, trusted = tuple(w.message for w in sound.verdict.warnings), sound.verdict.ok
         # Focal length and distance of a DLT always look alike; its own verdict names what matters.
         warnings = (*warnings, *(w for w in adjusted.warnings if "correlated" not in w))
     core = adjusted.core if adjusted else result.view
@@ -483,7 +498,7 @@ def _by_dlt(photo: Path, info: PhotoInfo, control: Sequence[ControlPoint], optio
             sigmas.describe(),
         ),
         warnings=warnings,
-        trusted=trusted,
+        doubts=(*(w.message for w in verdict.warnings if w.fatal), *unadjusted, *contradictions(view)),
         free=tuple(parts.parameters),
         facts={name: f"{value:.2f} ± {parts.sigma(name):.2f}" for name, value in figures.items()},
     )

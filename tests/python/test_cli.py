@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ import pytest
 from colourreg_rs import Camera, ControlPoint, PointCloud, Pose, View, _core
 from colourreg_rs.io.clouds import open_cloud, read_cloud, write_cloud
 from colourreg_rs.io.images import write_image
-from colourreg_rs.io.points import write_points
+from colourreg_rs.io.points import read_points, write_points
 from colourreg_rs.io.registration import read_registration, write_camera
 
 CAMERA = Camera("OPENCV", 600, 400, {"fx": 500.0, "fy": 500.0, "cx": 299.5, "cy": 199.5, "k1": -0.04})
@@ -77,6 +78,23 @@ def test_register_colourise_evaluate(job):
     plain = (source > 0) & (np.abs(xy % 256 - 128) < 100).all(1) & (xy > 0).all(1) & (xy < [599, 399]).all(1)
     assert np.abs(after.rgb[plain, :2] / 256 - xy[plain] % 256).max() < 0.01
     assert (after.rgb[source == 0] == 0).all()
+
+
+def test_exchanged_axes_are_refused_however_well_one_wall_fits(job):
+    """The mirror image of a wall is a wall: its points fit a view without a residual. The others tell."""
+    points = read_points(job / "points.csv")
+    middle = np.mean([p.xyz for p in points], axis=0)
+    mirrored = [replace(p, xyz=middle + (p.xyz - middle)[[0, 2, 1]]) for p in points]
+    write_points(job / "mirrored.csv", mirrored)
+    arguments = ["register", "scan.laz", "photo.png", "--points", "mirrored.csv", "--camera", "camera.json"]
+    done = colourreg(*arguments, "--out", "mirrored.json", cwd=job)
+    assert done.returncode == 1 and done.stderr.count("\n") == 1
+    assert "no view that can be trusted" in done.stderr and "--force" in done.stderr
+    assert not (job / "mirrored.json").exists()
+    done = colourreg(*arguments, "--out", "mirrored.json", "--force", cwd=job)
+    assert done.returncode == 0, done.stderr
+    view = read_registration(job / "mirrored.json").views[0]
+    assert view.statistics["doubts"]
 
 
 def test_dlt(job):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .assessment import ViewAssessment
+from .assessment import CHECK_ALPHA, ViewAssessment
 
 #: Angles that colours of scanners' own cameras are off by at worst, and those of third-party software: what the reader
 #: may compare with. Over eight scanners, published by their users.
@@ -17,17 +17,27 @@ UNEVEN = 2.5
 WORTHWHILE = 0.1
 
 
+def figure(value: float) -> str:
+    """Two digits behind the point below one, one above: millimetres as people read them."""
+    return f"{value:.2f}" if abs(value) < 1 else f"{value:.1f}"
+
+
 def in_all_units(assessed: ViewAssessment, pixels: float) -> str:
     """``0.42 px = 1.3 mm = 0.14 mrad`` at the points' usual distance."""
     if not np.isfinite(assessed.depth):
         return f"{pixels:.2f} px = {assessed.milliradians(pixels):.2f} mrad"
     mm, mrad = assessed.millimetres(pixels), assessed.milliradians(pixels)
-    return f"{pixels:.2f} px = {mm:.1f} mm at {assessed.depth:.1f} m = {mrad:.2f} mrad"
+    return f"{pixels:.2f} px = {figure(mm)} mm at {assessed.depth:.1f} m = {mrad:.2f} mrad"
 
 
 def advice(assessed: ViewAssessment) -> tuple[str, ...]:
     """Sentences that each say what to do and why, with the figure."""
     said = [*_of_disagreement(assessed), *_of_points(assessed), *_of_checks(assessed), *_of_the_next_point(assessed)]
+    said += [
+        f"{x.sentence()} Look at the overlay of the cloud's edges on the photo instead."
+        for x in assessed.agreement
+        if not x.tells
+    ]
     if not said:
         said.append("Nothing needs to be done: no test fails, and one more control point would gain little.")
     return tuple(said)
@@ -39,9 +49,15 @@ def headline(assessed: ViewAssessment) -> tuple[str, str]:
     worrying = [x for x in assessed.agreement if x.systematic and not x.explained]
     if worrying:
         return "bad", f"Cloud and photo lie apart: {worrying[0].sentence()}"
-    p = (assessed.check or {}).get("joint_p_value")
-    if p is not None and p < 0.001:
+    p, off = _check_verdict(assessed)
+    if p is not None and p < CHECK_ALPHA:
         return "bad", f"The check points differ from the view by more than its covariance allows (p = {p:.1g})."
+    if off:
+        several = len(off) > 1
+        return "look", (
+            f"Check point{'s' if several else ''} {', '.join(off)} contradict{'' if several else 's'} the view; the "
+            "others agree with it."
+        )
     test = a.get("variance_test")
     if test and not test["accepted"] and assessed.view.statistics.get("sigma0", 1.0) > 1:
         return "look", "The residuals are larger than the stated sigmas promise: see what to do next."
@@ -52,28 +68,33 @@ def headline(assessed: ViewAssessment) -> tuple[str, str]:
     if colour:
         mm, mrad = colour["mm"], colour["mrad"]
         return "good" if mrad["quantile_95"] < MAKERS_MRAD else "look", (
-            f"Expected error of a colour's place on the surfaces, one sigma per axis: {mm['median']:.1f} mm in the "
-            f"median, 95 % below {mm['quantile_95']:.1f} mm; as an angle {mrad['median']:.2f} and "
+            f"Expected error of a colour's place on the surfaces, one sigma per axis: {figure(mm['median'])} mm in the "
+            f"median, 95 % below {figure(mm['quantile_95'])} mm; as an angle {mrad['median']:.2f} and "
             f"{mrad['quantile_95']:.2f} mrad. Of the view alone, at {assessed.depth:.1f} m: "
             f"{figures['px']['median']:.2f} px = "
-            f"{figures['mm']['median']:.1f} mm in the median, {figures['px']['largest']:.2f} px at worst."
+            f"{figure(figures['mm']['median'])} mm in the median, {figures['px']['largest']:.2f} px at worst."
         )
     text = (
         f"Expected position error over the photo, one sigma per axis: {figures['px']['median']:.2f} px = "
-        f"{figures['mm']['median']:.1f} mm at {assessed.depth:.1f} m = {figures['mrad']['median']:.2f} mrad in the "
-        f"median, {figures['px']['largest']:.2f} px = {figures['mm']['largest']:.1f} mm = "
+        f"{figure(figures['mm']['median'])} mm at {assessed.depth:.1f} m = {figures['mrad']['median']:.2f} mrad in the "
+        f"median, {figures['px']['largest']:.2f} px = {figure(figures['mm']['largest'])} mm = "
         f"{figures['mrad']['largest']:.2f} mrad at worst."
     )
     word = "good" if figures["mrad"]["largest"] < MAKERS_MRAD else "look"
     return word, text
 
 
+def _check_verdict(assessed: ViewAssessment) -> tuple[float | None, list[str]]:
+    """The probability that counts, and the points that are off by themselves."""
+    check = assessed.check or {}
+    p = check.get("joint_p_value_of_the_others")
+    return check.get("joint_p_value") if p is None else p, list(check.get("off", ())) if p is not None else []
+
+
 def _of_disagreement(assessed: ViewAssessment) -> list[str]:
     said = []
     for agreement in assessed.agreement:
-        if not agreement.tells:
-            said.append(f"{agreement.title}: {agreement.reason} Look at the overlay of the cloud's edges on the photo.")
-        elif agreement.systematic and not agreement.explained:
+        if agreement.systematic and not agreement.explained:
             said.append(
                 f"Remove the systematic difference ({agreement.title}, {agreement.size:.2f} px), which is more than "
                 "the registration's own uncertainty: register again, with `--method sci --init` from here, or with "
@@ -137,7 +158,14 @@ def _of_points(assessed: ViewAssessment) -> list[str]:
 
 def _of_checks(assessed: ViewAssessment) -> list[str]:
     e = assessed.evaluation
-    p = (assessed.check or {}).get("joint_p_value")
+    p, off = _check_verdict(assessed)
+    if off and e is not None:
+        errors = {x.name: float(np.hypot(*x.residual_xy)) for x in e.points}
+        named = ", ".join(f"{name} ({errors[name]:.2f} px off)" for name in off)
+        return [
+            f"Look again at {named} of the check points, which the view contradicts (each tested at {CHECK_ALPHA}), "
+            f"while it agrees with the others (p = {p:.2g})."
+        ]
     if p is not None and p < 0.01:
         return [
             f"The check points contradict the covariance (p = {p:.1g}): something is systematically wrong, in the "

@@ -30,6 +30,10 @@ GRID = (25, 19)
 CANDIDATES, CANDIDATE_DEPTHS = (9, 7), (0.1, 0.5, 0.9)
 #: Places over the photo that are looked up on the cloud's surfaces.
 ON_SURFACES = (24, 18)
+#: The level at which a check point contradicts the view, and all of them together do.
+CHECK_ALPHA = 0.001
+#: The share of the photo that the cloud has to cover for that.
+LEAST_COVER = 0.05
 #: How many next control points are named.
 NEXT = 3
 
@@ -159,7 +163,16 @@ def _took_part(view: View, point: ControlPoint) -> bool:
 
 
 def _check(view: View, points: Sequence[ControlPoint], adjustment: dict[str, Any] | None) -> dict[str, Any] | None:
-    """The check points against what the covariance promises: probabilities of differences as large by chance."""
+    """The check points against what the covariance promises: probabilities of differences as large by chance. Where a
+    few are off by themselves, and no more than a fifth, the others are judged together again, without them."""
+    found = _tested(view, points, adjustment)
+    if found is None or not found["off"] or 5 * len(found["off"]) > len(found["points"]):
+        return found
+    rest = _tested(view, [p for p in points if p.name not in found["off"]], adjustment)
+    return found | {"joint_p_value_of_the_others": rest["joint_p_value"] if rest else None}
+
+
+def _tested(view: View, points: Sequence[ControlPoint], adjustment: dict[str, Any] | None) -> dict[str, Any] | None:
     seen = [p for p in points if np.isfinite(_core.project(view.core, p.xyz[None])[0]).all()]
     if not seen or view.covariance is None:
         return None
@@ -178,6 +191,7 @@ def _check(view: View, points: Sequence[ControlPoint], adjustment: dict[str, Any
             for k, p in enumerate(seen)
         ],
         "joint_p_value": plain(report["joint_p_value"]),
+        "off": [p.name for k, p in enumerate(seen) if report["p_value"][k] < CHECK_ALPHA],
     }
 
 
@@ -206,15 +220,18 @@ def next_points(view: View, depths: Sequence[float], adjustment: dict[str, Any] 
     return _best_of(view, np.tile(pixels, (len(levels), 1)), distance, targets, adjustment)
 
 
-def next_points_on(view: View, depth: FloatArray, adjustment: dict[str, Any] | None) -> tuple[NextPoint, ...]:
-    """The same on the cloud's own surfaces, as a picture of depths (H, W) of the reduced photo has them."""
+def next_points_on(view: View, depth: FloatArray, adjustment: dict[str, Any] | None) -> tuple[NextPoint, ...] | None:
+    """The same on the cloud's own surfaces, as a picture of depths (H, W) of the reduced photo has them; ``None`` where
+    the cloud covers too little of the photo."""
     if view.covariance is None:
-        return ()
+        return None
     height, width = depth.shape
     pixels = _spread_pixels(view, ON_SURFACES)
     column = ((pixels[:, 0] + 0.5) / view.core.width * width).astype(int)
     row = ((pixels[:, 1] + 0.5) / view.core.height * height).astype(int)
     distance = depth[row, column]
+    if np.isfinite(distance).mean() < LEAST_COVER:
+        return None
     return _best_of(view, pixels, distance, _core.backproject(view.core, pixels, distance), adjustment)
 
 
@@ -249,8 +266,10 @@ def _best_of(
         )  # fmt: skip
     except (DegenerateError, InvalidInputError):
         return ()
-    said = []
+    said: list[NextPoint] = []
     for k, i in enumerate(found["candidate"]):
+        if i in found["candidate"][:k]:
+            break  # to measure there again is no new place
         said.append(
             NextPoint(
                 (float(found["xy"][k][0]), float(found["xy"][k][1])),

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from .advice import advice, headline, in_all_units
-from .assessment import ViewAssessment, assess, at_depth, next_points_on
+from .advice import advice, figure, headline, in_all_units
+from .assessment import CHECK_ALPHA, ViewAssessment, assess, at_depth, next_points_on
 from .errors import FileError, InvalidInputError
 from .evaluate import table
 from .io.images import read_photo
@@ -66,7 +66,8 @@ def assess_registration(
         surface = surface_picture(scan, a.view)
         if surface is not None and np.isfinite(surface.depth).any():
             a = at_depth(a, float(np.nanmedian(surface.depth)))
-            a = replace(a, next_points=next_points_on(a.view, surface.depth, a.adjustment))
+            on_surfaces = next_points_on(a.view, surface.depth, a.adjustment)
+            a = a if on_surfaces is None else replace(a, next_points=on_surfaces)
         found.append(replace(a, surface=surface))
     progress("evaluating: comparing cloud and photos", 1 + len(views), steps)
     compared = agreements(scan, views, photos)
@@ -105,21 +106,26 @@ def _lines(assessed: ViewAssessment) -> list[str]:
     if assessed.check is not None and assessed.check["joint_p_value"] is not None:
         lines.append(
             f"check points together against the covariance: p = {assessed.check['joint_p_value']:.3g} "
-            "(below 0.001: wrong)"
+            f"(below {CHECK_ALPHA}: wrong)"
         )
+        if assessed.check.get("joint_p_value_of_the_others") is not None:
+            lines.append(
+                f"  without {', '.join(assessed.check['off'])}, each off by more than chance: "
+                f"p = {assessed.check['joint_p_value_of_the_others']:.3g}"
+            )
     if assessed.error_map is not None:
         f = assessed.error_map.figures()
         lines.append(
             f"expected error over the photo at {assessed.error_map.depth:.1f} m, one sigma per axis: median "
-            f"{f['px']['median']:.2f} px = {f['mm']['median']:.1f} mm = {f['mrad']['median']:.2f} mrad, at worst "
-            f"{f['px']['largest']:.2f} px = {f['mm']['largest']:.1f} mm = {f['mrad']['largest']:.2f} mrad"
+            f"{f['px']['median']:.2f} px = {figure(f['mm']['median'])} mm = {f['mrad']['median']:.2f} mrad, at worst "
+            f"{f['px']['largest']:.2f} px = {figure(f['mm']['largest'])} mm = {f['mrad']['largest']:.2f} mrad"
         )
     colour = assessed.surface.figures() if assessed.surface else None
     if colour is not None:
         mm, mrad = colour["mm"], colour["mrad"]
         lines.append(
-            f"ColourSigma on the surfaces: median {mm['median']:.1f} mm = {mrad['median']:.2f} mrad, 95 % below "
-            f"{mm['quantile_95']:.1f} mm"
+            f"ColourSigma on the surfaces: median {figure(mm['median'])} mm = {mrad['median']:.2f} mrad, 95 % below "
+            f"{figure(mm['quantile_95'])} mm"
         )
     lines += [x.sentence() for x in assessed.agreement]
     lines += [f"note: {note}" for note in assessed.notes]

@@ -326,10 +326,12 @@ def _components(result: _core.Adjustment, sigmas: PointSigmas, rows: Any) -> dic
 
 def _warnings(s: Mapping[str, Any], sigmas: PointSigmas) -> tuple[str, ...]:
     found = []
-    for a, b, r in s["high_correlations"]:
+    pairs = sorted(s["high_correlations"], key=lambda p: -abs(p[2]))
+    if pairs:
+        named = ", ".join(f"{a} and {b} by {r:.3f}" for a, b, r in pairs[:4])
+        more = f" and {len(pairs) - 4} more pairs" if len(pairs) > 4 else ""
         found.append(
-            f"{a} and {b} are correlated by {r:.3f} (above 0.95): the points hardly tell them apart; "
-            "their own sigmas say how well"
+            f"correlated above 0.95 are {named}{more}: the points hardly tell them apart; their own sigmas say how well"
         )
     test = s["variance_test"]
     if test is not None and sigmas.photo_known and not test[3]:

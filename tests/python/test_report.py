@@ -9,7 +9,13 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from test_adjustment_real_data import dbat
 from test_cli import colourreg, job  # noqa: F401  (the fixture)
+
+from colourreg_rs import ControlPoint, PointCloud
+from colourreg_rs.io.clouds import write_cloud
+from colourreg_rs.io.points import write_points
+from colourreg_rs.io.registration import read_registration
 
 
 class Page(HTMLParser):
@@ -140,3 +146,34 @@ def test_a_dlt_and_a_view_without_anything_but_its_pose_are_reported_too(made):
     done = colourreg("evaluate", "bare.json", "--cloud", "scan.laz", "--report", "bare.html", cwd=folder)
     assert done.returncode == 0, done.stderr
     assert "covariance" in done.stdout
+
+
+def test_a_photo_of_a_published_calibration(data_dir, tmp_path):
+    """A real photo of a hundred targets, with the published network's coordinates: half a tenth of a pixel."""
+    views, _, photo, xyz, _ = dbat(data_dir / "dbat_camcal")
+    marks = np.loadtxt(data_dir / "dbat_camcal" / "measurements" / "markpts.txt", delimiter=",", comments="#")
+    mine = np.flatnonzero(photo == 8)
+    points = [
+        ControlPoint(f"{int(marks[i, 1])}", xyz[i], marks[i, 2:4] - 1.0, "check" if k % 5 == 4 else "control")
+        for k, i in enumerate(mine)
+    ]
+    write_points(tmp_path / "points.csv", points)
+    write_cloud(tmp_path / "targets.ply", PointCloud(np.unique(xyz, axis=0)))
+    image = sorted((data_dir / "dbat_camcal" / "images").glob("*.JPG"))[8]
+    done = colourreg(
+        "register", "targets.ply", image, "--points", "points.csv", "--free", "pose,f,pp,distortion",
+        "--out", "photo.json", cwd=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    done = colourreg("evaluate", "photo.json", "--report", "photo.html", "--json", "photo-eval.json", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    (found,) = json.loads((tmp_path / "photo-eval.json").read_text())
+    assert found["adjustment"]["sigma_xy_found"] < 0.1 and found["control"]["n"] > 75
+    # The network's own residuals of point 90 are among its largest, too.
+    assert "90" in found["check_points"]["off"] and len(found["check_points"]["off"]) <= 3
+    assert found["check_points"]["joint_p_value_of_the_others"] > 0.01
+    text = (tmp_path / "photo.html").read_text(encoding="utf-8")
+    assert "data:image/jpeg;base64," in text and len(text) < 1_500_000
+    # Another lens model (measured to ideal, with an aspect) and one photo of a plane: near the published value only.
+    view = read_registration(tmp_path / "photo.json").views[0]
+    assert view.camera.params["fx"] == pytest.approx(views[8].camera.params["fx"], rel=0.01)

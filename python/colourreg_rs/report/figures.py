@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..agreement import Agreement
-from ..assessment import ErrorMap, ViewAssessment
+from ..assessment import LEAST_COVER, ErrorMap, ViewAssessment
 from ..model import FloatArray
 from ..surface_picture import SurfacePicture
 
@@ -110,6 +110,7 @@ def residual_histogram(assessed: ViewAssessment) -> str | None:
         axes.plot(x[:, 0], curve, color=INK, lw=1.8, label="expected")
         axes.set_xlabel("residual (computed − measured), px")
         axes.set_ylabel("coordinates")
+        axes.yaxis.get_major_locator().set_params(integer=True)
         axes.legend(frameon=False)
 
     return _drawn(draw)
@@ -144,6 +145,7 @@ def standardised_histogram(assessed: ViewAssessment) -> str | None:
         axes.plot(x, expected, color=INK, lw=1.8, label="expected")
         axes.set_xlabel("difference in its own sigmas")
         axes.set_ylabel("coordinates")
+        axes.yaxis.get_major_locator().set_params(integer=True)
         axes.legend(frameon=False)
 
     return _drawn(draw)
@@ -179,7 +181,7 @@ def correlation_matrix(assessed: ViewAssessment) -> str | None:
 
 def sigma_map(picture: SurfacePicture) -> str | None:
     """ColourSigma on the surfaces that the photo shows."""
-    if picture.sigma is None or not np.isfinite(picture.sigma).any():
+    if picture.sigma is None or np.isfinite(picture.sigma).mean() < LEAST_COVER:
         return None
     values = 1e3 * picture.sigma
     height, width = values.shape
@@ -211,7 +213,7 @@ def sigma_histogram(picture: SurfacePicture) -> str | None:
 
     def draw(figure: Any, axes: Any) -> None:
         low, high = float(values.min()), float(values.max())
-        low, high = min(low, 0.3), max(high, 1.3 * THIRD_PARTY_MRAD)
+        low, high = min(low, 0.3), max(high, 2.5 * THIRD_PARTY_MRAD)
         axes.hist(
             values,
             bins=list(np.geomspace(max(low, 1e-3), high, 50)),
@@ -225,7 +227,7 @@ def sigma_histogram(picture: SurfacePicture) -> str | None:
         top = axes.get_ylim()[1]
         for place, name in ((MAKERS_MRAD, "makers'\ncameras"), (THIRD_PARTY_MRAD, "third-party\nsoftware")):
             axes.axvline(place, color=ORANGE, lw=1.5)
-            axes.text(place * 0.95, top * 0.98, name, color=ORANGE, va="top", ha="right", fontsize=8.5)
+            axes.text(place * 1.05, top * 0.98, name, color=ORANGE, va="top", ha="left", fontsize=8.5)
         axes.set_xlabel("position error as an angle, mrad")
         axes.set_ylabel("% of the photo")
 

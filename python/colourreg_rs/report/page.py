@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
-from ..advice import advice, headline
+from ..advice import advice, figure, headline
 from ..agreement import Agreement
 from ..assessment import ViewAssessment
 from ..evaluate import Accuracy, PointError
@@ -113,11 +113,11 @@ def _tiles(assessed: ViewAssessment) -> list[dict[str, str]]:
     s, a = assessed.view.statistics, assessed.adjustment or {}
     if assessed.error_map:
         f = assessed.error_map.figures()
-        tiles.append(("expected error, median", f"{f['px']['median']:.2f} px = {f['mm']['median']:.1f} mm"))
-        tiles.append(("expected error, at worst", f"{f['px']['largest']:.2f} px = {f['mm']['largest']:.1f} mm"))
+        tiles.append(("expected error, median", f"{f['px']['median']:.2f} px = {figure(f['mm']['median'])} mm"))
+        tiles.append(("expected error, at worst", f"{f['px']['largest']:.2f} px = {figure(f['mm']['largest'])} mm"))
     colour = assessed.surface.figures() if assessed.surface else None
     if colour:
-        tiles.append(("ColourSigma on the surfaces, median", f"{colour['mm']['median']:.1f} mm"))
+        tiles.append(("ColourSigma on the surfaces, median", f"{figure(colour['mm']['median'])} mm"))
         tiles.append(("the same as an angle", f"{colour['mrad']['median']:.2f} mrad"))
     e = assessed.evaluation
     if e and e.check:
@@ -149,7 +149,7 @@ def _rms_rows(assessed: ViewAssessment) -> list[dict[str, str]]:
         return {
             "name": name, "n": str(x.n), "x": _number(x.rms_x, 3), "y": _number(x.rms_y, 3), "rms": _number(x.rms, 3),
             "rmse": _number(x.rmse, 3), "mrad": _number(assessed.milliradians(x.rmse), 3),
-            "object_rms": _number(1e3 * x.object_rms, 1), "object_rmse": _number(1e3 * x.object_rmse, 1),
+            "object_rms": figure(1e3 * x.object_rms), "object_rmse": figure(1e3 * x.object_rmse),
             "worst": f"{x.worst}, {x.worst_px:.2f} px",
         }  # fmt: skip
 
@@ -179,8 +179,8 @@ def _charts(assessed: ViewAssessment) -> list[dict[str, str]]:
         "Each point against the estimate without it, in its own sigma: free of the points' own pull on the view.",
     ))  # fmt: skip
     if assessed.surface is not None and assessed.surface.sigma is not None:
-        figure = assessed.surface.figures()
-        median = f"{figure['mm']['median']:.1f} mm in the median" if figure else ""
+        colour = assessed.surface.figures()
+        median = f"{figure(colour['mm']['median'])} mm in the median" if colour else ""
         charts.append((
             figures.sigma_map(assessed.surface),
             f"Map of ColourSigma over the photo {name}: {median}.",

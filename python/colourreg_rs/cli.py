@@ -371,6 +371,23 @@ def backproject(
     _write_json(json_file, result.as_dict())
 
 
+@app.command()
+def reproduce(
+    experiment: Annotated[str, typer.Argument(help="table1, table2 or all.")] = "all",
+    out: Annotated[Path | None, typer.Option(help="Folder for tables and pictures.")] = None,
+    json_file: JsonOption = None,
+) -> None:
+    """The experiments of the paper that this package began with, beside its figures and this package's own."""
+    from .experiments import reproduce as run
+
+    with terminal_bars() as progress:
+        result = run(experiment, progress)
+    print(result.text())
+    if out is not None:
+        print("\nwrote " + ", ".join(str(path) for path in result.write(out)))
+    _write_json(json_file, result.as_dict())
+
+
 for _command, _american in ((colourise, "colorize"),):
     app.command(_american, hidden=True)(_command)
 

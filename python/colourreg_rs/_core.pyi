@@ -891,7 +891,8 @@ class SurfaceSigma:
         *,
         normals: FloatArray | None = None,
     ) -> None:
-        """As :meth:`at`, into ``out`` (N,), only where ``source`` (N,) is ``number``."""
+        """As :meth:`at`, into ``out`` (N,), only where ``source`` (N,) is ``number``; rounded to eight binary places
+        (0.2 %), which pack well."""
 
 class Neighbours:
     """Points of the plane or of space, ready to be searched for the nearest ones. Immutable; batches run in parallel.

@@ -67,7 +67,8 @@ def test_regions_of_a_similarity_hold_the_truth(rng):
     scale, shift = 1.2, np.array([1000.0, -500.0, 70.0])
     target = scale * source @ R.T + shift
     cov = covariances(10, 0.01, 3), covariances(10, 0.02, 3)
-    held, factors = 0, np.empty(N)
+    others = rng.uniform(-10, 10, (30, 3)) + np.array([200.0, 100.0, 50.0])
+    held, moved, factors = 0, 0, np.empty(N)
     for k in range(N):
         a, b = source + 0.01 * rng.standard_normal((10, 3)), target + 0.02 * rng.standard_normal((10, 3))
         result = _core.adjust_similarity(a, b, *cov, snoop=False)
@@ -77,8 +78,18 @@ def test_regions_of_a_similarity_hold_the_truth(rng):
         error = np.concatenate([[s - scale], turn, translation - shift])
         statistics = result.statistics()
         held += squared_distance(error, result.covariance) < _core.region_limit(0.95, 7, statistics["dof"])
+        # Where other points go: derivatives by scale, by a rotation vector on the left, and by translation.
+        arms = others @ rotation.T
+        rows = np.zeros((30, 3, 7))
+        rows[:, :, 0], rows[:, :, 4:] = arms, np.eye(3)
+        for axis in range(3):
+            rows[:, :, 1 + axis] = s * np.cross(np.eye(3)[axis], arms)
+        off = s * arms + translation - (scale * others @ R.T + shift)
+        covariance = rows @ result.covariance @ rows.transpose(0, 2, 1)
+        moved += (squares(off, covariance) < _core.region_limit(0.95, 3, statistics["dof"])).mean()
         factors[k] = statistics["variance_factor"]
     assert 0.935 < held / N < 0.965, held / N
+    assert 0.935 < moved / N < 0.965, moved / N
     assert abs(factors.mean() - 1) < 3.5 * factors.std() / np.sqrt(N)
 
 

@@ -44,10 +44,11 @@ def with_edges(photo: Image, edges: npt.NDArray[np.bool_]) -> Image:
     """The photo, a little dimmed, with edges of the cloud over it."""
     from PIL import Image as Pillow
 
-    height, width = edges.shape
+    height, width = max(photo.shape[0], edges.shape[0]), max(photo.shape[1], edges.shape[1])
     picture = np.asarray(Pillow.fromarray(photo).resize((width, height), Pillow.Resampling.LANCZOS))
     picture = (picture * 0.72).astype(np.uint8)
-    picture[edges] = (255, 64, 200)
+    drawn = Pillow.fromarray(edges).resize((width, height), Pillow.Resampling.NEAREST)
+    picture[np.asarray(drawn)] = (255, 64, 200)
     return picture
 
 

@@ -1,0 +1,229 @@
+"""How well does registration without picks do, by the truth, and does it know how well?
+
+Simulated scenes with realistic materials and lighting, each scanned and photographed with its own seed; the true view
+is turned about a random axis and moved in a random direction, and registered again. For every registration: the rms
+distance in the photo, over the points that it sees, between where the result and the truth project them; the same as the
+result's covariance predicts it; whether the program believed its result; and whether the truth lies in the 95 %
+region that it states for the six parameters of the pose.
+
+    python -m colourreg_rs.experiments.sci_accuracy --scene facade --scene room --seeds 10
+
+Source of the region: χ² with six degrees of freedom of the error in the covariance's metric.
+"""
+
+from __future__ import annotations
+
+import argparse
+import pickle
+import time
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from .. import _core
+from ..model import FloatArray, PointCloud, Pose, View
+from ..register_sci import SciOptions, SciRegistration, register_sci
+from ..sci import render_sci, with_size
+
+#: χ² with six degrees of freedom holds 95 % below this.
+LIMIT_95 = 12.592
+
+#: Starts that are tried: degrees, metres.
+STARTS = ((0.5, 0.02), (3.0, 0.2))
+
+
+@dataclass(frozen=True)
+class Case:
+    """A photo with its true view, the scan that it is registered to and where the scanner stood."""
+
+    scene: str
+    seed: int
+    scan: PointCloud
+    image: npt.NDArray[np.uint8]
+    truth: View
+    station: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One registration against its truth.
+
+    - ``start`` and ``error``: rms distances in the photo over all visible points, px; of a failure ``error`` is that of
+      the view that it would have returned, which is the start.
+    - ``predicted``: the same distance as the covariance has it, px. ``distance``: the squared Mahalanobis distance of
+      the pose's error; both NaN for a failure.
+    """
+
+    scene: str
+    seed: int
+    degrees: float
+    metres: float
+    start: float
+    error: float
+    predicted: float
+    distance: float
+    trusted: bool
+    reasons: tuple[str, ...]
+    seconds: float
+
+    @property
+    def inside(self) -> bool:
+        """Whether the truth lies in the stated 95 % region."""
+        return self.distance < LIMIT_95
+
+
+def simulated(scene: str, seed: int, size: tuple[int, int], cache: Path | None = None) -> Case:
+    """A scene's first photo and its scan; kept in ``cache`` where that is given."""
+    from ..simulate import simulate
+
+    file = None if cache is None else cache / f"{scene}-{seed}-{size[0]}x{size[1]}.pickle"
+    if file is not None and file.exists():
+        case: Case = pickle.loads(file.read_bytes())
+        return case
+    made = simulate(scene, seed=seed, photos=1, size=size, samples=4)
+    photo = made.photos[0]
+    case = Case(scene, seed, made.scan, photo.image, replace(photo.view), made.stations[0])
+    if file is not None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(pickle.dumps(case))
+    return case
+
+
+def disturbed(view: View, rng: np.random.Generator, degrees: float, metres: float) -> View:
+    """The view turned about a random axis and moved in a random direction, by so much."""
+    assert view.pose is not None
+    axis, shift = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
+    cross = np.cross(np.eye(3), -axis)
+    angle = np.radians(degrees)
+    turn = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    return replace(view, pose=Pose.from_centre(turn @ view.pose.rotation, view.pose.centre + shift * metres))
+
+
+def visible_points(cloud: PointCloud, view: View) -> FloatArray:
+    """Points (N, 3) of the cloud that the view sees, even over the photo."""
+    core = view.core
+    sci = render_sci(cloud, with_size(view, 480, round(480 * core.height / core.width)))
+    return np.ascontiguousarray(cloud.xyz[sci.index[sci.measured]])
+
+
+def rms_distance(found: View, truth: View, xyz: FloatArray) -> float:
+    """Of the projections of points by two views, px; infinite where a point is not seen by ``found``."""
+    apart = _core.project(found.core, xyz)[0] - _core.project(truth.core, xyz)[0]
+    square = (apart**2).sum(1)
+    return float(np.sqrt(square.mean())) if np.isfinite(square).all() else float("inf")
+
+
+def pose_error(found: View, truth: View) -> FloatArray:
+    """What takes the true pose from the one found, as covariances count it: rotation vector on the left, centre."""
+    assert found.pose is not None and truth.pose is not None
+    turn = truth.pose.rotation @ found.pose.rotation.T
+    # For the small angles of a registration's error sin is the angle.
+    vector = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    return np.concatenate([vector, truth.pose.centre - found.pose.centre])
+
+
+def register(case: Case, degrees: float, metres: float) -> tuple[Outcome, SciRegistration]:
+    """Registers a case from a disturbed start."""
+    rng = np.random.default_rng([zlib.crc32(case.scene.encode()), case.seed, round(100 * degrees)])
+    start = disturbed(case.truth, rng, degrees, metres)
+    begin = time.perf_counter()
+    result = register_sci(case.scan, case.image, start, SciOptions(station=case.station))
+    seconds = time.perf_counter() - begin
+    xyz = visible_points(case.scan, case.truth)
+    predicted = distance = float("nan")
+    if result.trusted and result.view.covariance is not None:
+        predicted = float(np.sqrt(2.0)) * result.predicted_error
+        error = pose_error(result.view, case.truth)
+        distance = float(error @ np.linalg.solve(result.view.covariance.matrix, error))
+    outcome = Outcome(
+        case.scene, case.seed, degrees, metres, rms_distance(start, case.truth, xyz),
+        rms_distance(result.view, case.truth, xyz), predicted, distance, result.trusted, result.reasons, seconds,
+    )  # fmt: skip
+    return outcome, result
+
+
+def run(
+    scenes: Sequence[str], seeds: Sequence[int], size: tuple[int, int], cache: Path | None = None
+) -> Iterator[Outcome]:
+    """All scenes, seeds and starts."""
+    for scene in scenes:
+        for seed in seeds:
+            case = simulated(scene, seed, size, cache)
+            for degrees, metres in STARTS:
+                yield register(case, degrees, metres)[0]
+
+
+def line(o: Outcome) -> str:
+    """A row of the table."""
+    verdict = "inside" if o.inside else "OUTSIDE"
+    figures = f"{o.error:8.3f} | {o.predicted:9.3f} | {o.distance:8.1f} | {verdict:7}"
+    if not o.trusted:
+        figures = f"{'failed':>8} | {'':9} | {'':8} | {'':7}"
+    return f"| {o.scene:7} | {o.seed:4} | {o.degrees:4.1f}° {o.metres:.2f} m | {o.start:7.1f} | {figures} | {o.seconds:5.1f} |"
+
+
+HEADER = (
+    "| scene   | seed | start off    | px      |  rms px  | predicted |    χ²    | 95 %    |   s   |\n"
+    "| ------- | ---: | ------------ | ------: | -------: | --------: | -------: | ------- | ----: |"
+)
+
+
+def summary(outcomes: Sequence[Outcome]) -> str:
+    """The figures of each scene and start, and the coverage over all."""
+    rows = [
+        "| scene   | start off    | photos | trusted | median px | largest px | below 0.5 px | in the 95 % region | s   |",
+        "| ------- | ------------ | -----: | ------: | --------: | ---------: | -----------: | -----------------: | --: |",
+    ]
+    groups = sorted({(o.scene, o.degrees, o.metres) for o in outcomes})
+    for group in groups:
+        mine = [o for o in outcomes if (o.scene, o.degrees, o.metres) == group]
+        good = [o for o in mine if o.trusted]
+        errors = np.array([o.error for o in good] or [float("nan")])
+        rows.append(
+            f"| {group[0]:7} | {group[1]:4.1f}° {group[2]:.2f} m | {len(mine):6} | {len(good):7} | "
+            f"{np.median(errors):9.3f} | {errors.max():10.3f} | {(errors < 0.5).sum():12} | "
+            f"{sum(o.inside for o in good):18} | {np.median([o.seconds for o in mine]):3.1f} |"
+        )
+    good = [o for o in outcomes if o.trusted]
+    wrong = [o for o in good if o.error > max(1.0, 4 * o.predicted)]
+    inside = sum(o.inside for o in good)
+    rows.append("")
+    rows.append(
+        f"{len(outcomes)} registrations, {len(good)} trusted, {len(wrong)} of them wrong (more than 1 px and four times "
+        f"the predicted error); {inside} of {len(good)} hold the truth in their 95 % region "
+        f"({100 * inside / max(len(good), 1):.0f} %)."
+    )
+    return "\n".join(rows)
+
+
+def _seeds(text: str) -> list[int]:
+    first, _, last = text.partition(":")
+    return list(range(int(first), int(last))) if last else list(range(int(first)))
+
+
+def main() -> None:
+    """Prints both tables."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--scene", action="append", help="facade, room, square, corner; several times for several")
+    parser.add_argument("--seeds", default="10", help="how many, or FIRST:LAST")
+    parser.add_argument("--size", default="1200x800", help="of the photos")
+    parser.add_argument("--cache", type=Path, help="a folder that keeps the simulations")
+    arguments = parser.parse_args()
+    width, height = (int(n) for n in arguments.size.split("x"))
+    outcomes = []
+    print(HEADER, flush=True)
+    for outcome in run(arguments.scene or ["facade", "room"], _seeds(arguments.seeds), (width, height), arguments.cache):
+        print(line(outcome), flush=True)
+        for reason in outcome.reasons:
+            print(f"    {reason}", flush=True)
+        outcomes.append(outcome)
+    print()
+    print(summary(outcomes))
+
+
+if __name__ == "__main__":
+    main()

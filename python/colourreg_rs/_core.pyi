@@ -278,6 +278,24 @@ def match_templates(
     :data:`MATCH_OUTCOMES`. One row for each template, or, with several ``hypotheses``, one for each peak; then
     ambiguity is left to the caller. Raises InvalidInputError."""
 
+def score_templates(
+    sci: Features,
+    photo: Features,
+    points: npt.NDArray[np.int64],
+    *,
+    half: int = 12,
+    radius: int = 4,
+    least_known: float = 0.5,
+) -> tuple[npt.NDArray[np.float32], FloatArray]:
+    """The scores of each template of :func:`match_templates` at all its shifts: (N (2 radius + 1)²,), template by
+    template, row by row from the shift (-radius, -radius), NaN where too little is known; and the number of independent
+    pixels (N,) behind them, 0 where the template is not known. Raises InvalidInputError."""
+
+def masked_blur(
+    image: npt.NDArray[np.float32], known: npt.NDArray[np.bool_] | None, sigma: float
+) -> npt.NDArray[np.float32]:
+    """A Gaussian blur of ``sigma`` px of an image (H, W) that takes known pixels alone; 0 where none is near."""
+
 def relief(inverse_depth: npt.NDArray[np.float32], points: npt.NDArray[np.int64], half: int) -> npt.NDArray[np.float64]:
     """How far the surface within ``half`` px around each point (N, 2: column, row) departs from a plane: rms (N,),
     relative to the depth; NaN where too little is known."""

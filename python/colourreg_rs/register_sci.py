@@ -1,13 +1,13 @@
 """From an approximate view to a registration, without picking: the loop of SCI, matching and resection.
 
-The SCI is rendered at the current view and matched with the photo; each match gives a point of the cloud and its place
-in the photo; a robust resection gives the next view; and the SCI is rendered again, until the view stands still.
-Coarse to fine: at the coarsest level templates span many degrees and are searched over the whole of the start's
-uncertainty; the finest level is the one that the cloud's density supports. The single pass of Forkuo and King is one
-turn of it.
+The SCI is rendered at the current view and matched with the photo; resection gives the next view; and the SCI is
+rendered again, until the view stands still. Coarse to fine: at the coarsest level templates span many degrees, are
+searched over the whole of the start's uncertainty, each for itself, and a robust resection takes those that agree; from
+there on all templates are taken together (:mod:`.surfaces`). The single pass of Forkuo and King is the first turn alone,
+at the finest level.
 
-A result is believed only if templates that are searched far beyond their own noise come back to where they were
-(``confirmed``); one that is not is returned as a failure, with the figures that say so.
+A result is believed only if the patches of the photo, each searched far beyond its own noise, come back to where they
+were (``confirmed``); one that is not is returned as a failure, with the figures that say so.
 """
 
 from __future__ import annotations
@@ -29,19 +29,29 @@ from .correspondences import (
     supported_scale,
 )
 from .errors import DegenerateError, InvalidInputError, NotConvergedError
-from .match_covariance import design, match_covariance, tukey_weights
+from .match_covariance import design, match_covariance
 from .model import Covariance, FloatArray, PointCloud, Pose, View
 from .sci import SCI
+from .surfaces import Linearised, Surfaces, find_surfaces, joined
 
-#: Interest points per point of the SCI's own density: the finest level has this many pixels per spacing of the points.
-OVERSAMPLING = 1.5
+#: The finest level has this many pixels per spacing of the points: matches err by a share of the level's pixel, whatever
+#: the spacing, since points count at their own places in the pixels.
+OVERSAMPLING = 3.0
 
 #: The coarsest level has about this many pixels along the long side.
 COARSEST = 300
 
-#: Residuals beyond this many stated sigmas do not pull. Matches are sharper than their stated sigma (their median is
-#: half of it on simulated scenes), so that one half of it is the unit.
-UNIT = 0.5
+#: So many renderings of the finest level are taken together.
+TOGETHER = 4
+
+#: Single templates whose likeness is less than this are no match.
+LIKE = 0.2
+
+#: The photo is confirmed in so many patches along its long and its short side.
+PATCHES = (6, 4)
+
+#: So many of them have to come back.
+CONFIRMED = 0.4
 
 
 @dataclass(frozen=True)
@@ -63,20 +73,19 @@ class SciOptions:
     shift: float = 0.5
     priors: tuple[tuple[str, float, float], ...] = ()
     tolerance: float = 0.1
-    passes: int = 10
+    passes: int = 8
     single: bool = False
     station: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True)
 class Turn:
-    """One turn of the loop: at ``scale`` of the photo, ``templates`` were searched, ``matched`` found, ``used`` agreed
-    with the new view, which ``moved`` this far at most anywhere in the photo, px."""
+    """One turn of the loop: at ``scale`` of the photo, ``templates`` were searched, ``matched`` are alike, and the view
+    ``moved`` this far at most anywhere in the photo, px."""
 
     scale: float
     templates: int
     matched: int
-    used: int
     moved: float
 
 
@@ -87,11 +96,12 @@ class SciRegistration:
     - ``view``: the new view with its covariance, or the start where the result is not to be believed.
     - ``trusted`` and ``reasons``: whether it is, and why not.
     - ``turns``: what happened.
-    - ``confirmed``: of templates searched over a wide window at the result, the share that came back to within
-      ``confirmed_within`` px of the photo; by chance it would be ``by_chance``.
-    - ``correspondences`` and ``weights``: of the last turn; weight 0 took no part.
+    - ``confirmed``: of the photo's patches, each searched over a wide window at the result, the share that came back to
+      within ``confirmed_within`` px of the photo; by chance it would be ``by_chance``.
+    - ``matches``: the templates of the last turn, as seen from the view.
+    - ``used``: how many of them are alike.
     - ``predicted_error``: rms over the photo of the position error that the covariance predicts, px per coordinate.
-    - ``improvement``: mean likeness at the result less that at the start, of the same points, and its standard error.
+    - ``improvement``: mean likeness at the result less that at the start, and its standard error.
     """
 
     view: View
@@ -101,16 +111,11 @@ class SciRegistration:
     confirmed: float
     confirmed_within: float
     by_chance: float
-    correspondences: Correspondences | None
-    weights: FloatArray
+    matches: Linearised | None
+    used: int
     predicted_error: float
     improvement: tuple[float, float]
     statistics: dict[str, Any]
-
-    @property
-    def used(self) -> int:
-        """Matches that took part."""
-        return int((self.weights > 0).sum())
 
 
 class _LoopError(Exception):
@@ -178,41 +183,78 @@ class _Loop:
     # The turns -------------------------------------------------------------------------------------------------
 
     def _scales(self) -> list[float]:
-        supported = supported_scale(self.cloud, self.start)
-        if supported == 0.0:
+        self.supported = supported_scale(self.cloud, self.start)
+        if self.supported == 0.0:
             raise _LoopError("no point of the cloud lies in the photo at the start")
-        finest = min(1.0, OVERSAMPLING * supported)
+        finest = min(1.0, OVERSAMPLING * self.supported)
         scales = [finest]
         while not self.options.single and scales[0] * self.long_side > 1.5 * COARSEST:
             scales.insert(0, scales[0] / 2)
         return scales
 
     def _iterate(self) -> View:
-        view, scales = self.start, self._scales()
+        scales = self._scales()
+        view = self._from_afar(self.start, scales[0])
+        if self.options.single:
+            self.last = self._surfaces(view, scales[0], 5)
+            return view
         for level, scale in enumerate(scales):
             finest = level == len(scales) - 1
-            per_radian = pixels_per_radian(self.start) * scale
-            for turn in range(self.options.passes if finest else 4):
-                if level == 0 and turn == 0:
-                    radius = int(np.clip(np.ceil(self.options.search * per_radian), 4, 80))
-                    search = Search(half=24 if not finest else 12, radius=radius, cell=8, per_cell=2, hypotheses=3)
-                elif level == 0 and not finest:
-                    search = Search(half=20 if turn == 1 else 16, radius=8, cell=8)
-                else:
-                    search = Search(radius=8 if turn == 0 else 4, cell=max(8, round(scale * self.long_side / 50)))
-                found = self._find(view, scale, search)
-                first = search.hypotheses > 1
-                new = self._resect(self._consensus(view, found) if first else view, found, finest and not first, first)
+            renderings: list[Surfaces] = []
+            for turn in range(self.options.passes if finest else 3):
+                found = self._surfaces(view, scale, 8 if turn == 0 else 5, turn)
+                # Every rendering has noise of its own: where points happen to lie in their pixels. Taken together, the
+                # last few have less of it, and the view comes to rest.
+                if turn > 0:
+                    renderings = [*renderings[1 - TOGETHER :], found]
+                new = self._climbed(view, joined(renderings) if renderings else found, finest)
                 moved = self._moved(view, new)
-                weights = self._weights(new, found)
-                self.turns.append(Turn(scale, found.templates, len(found), int((weights > 0).sum()), moved))
-                view = new
-                self.last = found
-                if self.options.single:
+                self.turns.append(Turn(scale, len(found), int((found.here > LIKE).sum()), moved))
+                view, self.last = new, found
+                if moved < (self.options.tolerance if finest else 0.5 / scale):
                     break
-                enough = self.options.tolerance if finest else 0.5 / scale
-                if moved < enough and not (level == 0 and turn == 0):
-                    break
+        return view
+
+    def _from_afar(self, view: View, scale: float) -> View:
+        """The first turn: large templates, each searched over the whole of the start's uncertainty."""
+        per_radian = pixels_per_radian(self.start) * scale
+        radius = int(np.clip(np.ceil(self.options.search * per_radian), 4, 80))
+        half = 12 if self.options.single else 24
+        found = self._find(view, scale, Search(half=half, radius=radius, cell=8, per_cell=2, hypotheses=3))
+        new = self._consensus(view, found)
+        for unit in (8.0, 3.0, 1.0):
+            new = self._resect(new, found.xyz, found.xy, found.covariance * unit**2, "tukey", False)
+        self.turns.append(Turn(scale, found.templates, len(found), self._moved(view, new)))
+        return new
+
+    def _surfaces(self, view: View, scale: float, radius: int, offset: int = 0) -> Surfaces:
+        found, sci = find_surfaces(
+            self.cloud, view, self.photo, scale, radius=radius, spacing=scale / self.supported, offset=offset,
+            station=self.station, exponents=self.exponents,
+        )  # fmt: skip
+        self.exponents = sci.exponents
+        if len(found) < 12:
+            raise _LoopError(
+                f"only {len(found)} templates of the cloud's picture lie in the photo at {scale:.3f} of its size; at "
+                f"least 12 are needed"
+            )
+        return found
+
+    def _climbed(self, view: View, found: Surfaces, final: bool) -> View:
+        """The view at which the templates' likeness is largest in sum, from here upwards."""
+        surfaces = found.log_likelihood()
+        here = found.linearised(view, surfaces)
+        for _ in range(8):
+            if len(here.xyz) < 12:
+                raise _LoopError(f"only {len(here.xyz)} templates lie within their windows; at least 12 are needed")
+            new = self._resect(view, here.xyz, here.xy, here.covariance, "squares", final)
+            there = found.linearised(new, surfaces)
+            if there.value <= here.value:
+                break
+            moved = self._moved(view, new)
+            view, here = new, there
+            if moved < 0.2 * self.options.tolerance:
+                break
         return view
 
     def _find(self, view: View, scale: float, search: Search) -> Correspondences:
@@ -272,8 +314,9 @@ class _Loop:
         u, _, v = np.linalg.svd(rotation)
         return replace(view, pose=Pose.from_centre(u @ v, core.centre))
 
-    def _resect(self, view: View, found: Correspondences, final: bool, first: bool) -> View:
-        """Robust resection from here; the first one from afar, step by step."""
+    def _resect(
+        self, view: View, xyz: FloatArray, xy: FloatArray, covariance: FloatArray, loss: str, final: bool
+    ) -> View:
         free = list(self.options.free) if final else ["pose"]
         priors = list(self.options.priors)
         held = {name for name, _, _ in priors}
@@ -282,21 +325,14 @@ class _Loop:
             for k, name in enumerate(("cx_world", "cy_world", "cz_world")):
                 if name not in held:
                     priors.append((name, float(centre[k]), self.options.shift))
-        core = view.core
-        self.names: list[str] = []
-        for unit in (8.0, 3.0, 1.0) if first else (UNIT,):
-            result = _core.resect(
-                core, found.xyz, found.xy, free=free, sigma_xy=found.covariance * unit**2, priors=priors,
-                loss="tukey", start="given",
-            )  # fmt: skip
-            core, self.names = result.view, result.parameters
-        camera = view.camera
+        result = _core.resect(
+            view.core, xyz, xy, free=free, sigma_xy=covariance, priors=priors, loss=loss, start="given"
+        )  # fmt: skip
+        self.names = result.parameters
+        camera, core = view.camera, result.view
         assert camera is not None
         params = dict(zip(camera.params, core.params.tolist(), strict=True))
         return replace(view, camera=replace(camera, params=params), pose=Pose(core.rotation, core.translation))
-
-    def _weights(self, view: View, found: Correspondences) -> FloatArray:
-        return tukey_weights(view, found.xyz, found.xy, found.covariance * UNIT**2)
 
     def _moved(self, before: View, after: View) -> float:
         a, _ = _core.project(before.core, self.witnesses)
@@ -308,16 +344,12 @@ class _Loop:
     # The verdict -----------------------------------------------------------------------------------------------
 
     def _judged(self, view: View) -> SciRegistration:
-        found = self.last
-        weights = self._weights(view, found)
-        reasons: list[str] = []
-        last = self.turns[-1]
-        if not self.options.single and last.moved >= self.options.tolerance:
-            reasons.append(f"the view still moves by {last.moved:.2f} px after {len(self.turns)} turns")
-        used = weights > 0
-        if used.sum() < 20:
-            reasons.append(f"only {int(used.sum())} matches agree with the view; 20 are needed")
-        covariance = match_covariance(view, self.names, found.xyz, found.xy, found.covariance * UNIT**2, found.pixel)
+        found, last, reasons = self.last, self.turns[-1], list[str]()
+        used = int((found.here > LIKE).sum())
+        if used < 20:
+            reasons.append(f"only {used} templates are alike at the view; 20 are needed")
+        matches = found.linearised(view)
+        covariance = match_covariance(view, self.names, matches.xyz, matches.xy, matches.covariance, found.pixel)
         predicted = float("nan")
         if covariance is None:
             reasons.append("the matches do not determine the view")
@@ -326,11 +358,15 @@ class _Loop:
             view = replace(view, covariance=covariance)
             if predicted > 5.0:
                 reasons.append(f"the predicted error over the photo is {predicted:.1f} px; the matches are too few")
-        confirmed, within, by_chance, wide = self._confirmed(view)
-        if confirmed < max(0.25, 5 * by_chance):
+        # A view that moves by less than its own error stands still.
+        if not self.options.single and last.moved >= max(self.options.tolerance, predicted):
+            reasons.append(f"the view still moves by {last.moved:.2f} px after {len(self.turns)} turns")
+        confirmed, within, by_chance, patches = self._confirmed(view)
+        if patches < 4 or confirmed < max(CONFIRMED, 5 * by_chance):
             reasons.append(
-                f"of {wide} templates searched over a wide window only {100 * confirmed:.0f} % come back to within "
-                f"{within:.1f} px of their place; by chance it would be {100 * by_chance:.0f} %"
+                f"of {patches} patches of the photo searched over a wide window {100 * confirmed:.0f} % come back to "
+                f"within {within:.1f} px of their place, and {100 * CONFIRMED:.0f} % are needed; by chance it would be "
+                f"{100 * by_chance:.0f} %"
             )
         improvement = self._improvement(view)
         if improvement[0] < -2 * improvement[1]:
@@ -338,21 +374,21 @@ class _Loop:
                 f"the start fits better: mean likeness {improvement[0]:+.4f} ± {improvement[1]:.4f} against it"
             )
         statistics = {
-            "matches": len(found), "used": int(used.sum()), "turns": len(self.turns), "confirmed": confirmed,
+            "matches": len(found), "used": used, "turns": len(self.turns), "confirmed": confirmed,
             "confirmed_by_chance": by_chance, "predicted_error_px": predicted, "last_move_px": last.moved,
             "improvement": improvement[0],
         }  # fmt: skip
         trusted = not reasons
         result = replace(view, method="sci", statistics=statistics) if trusted else self.start
         return SciRegistration(
-            result, trusted, tuple(reasons), tuple(self.turns), confirmed, within, by_chance, found, weights,
+            result, trusted, tuple(reasons), tuple(self.turns), confirmed, within, by_chance, matches, used,
             predicted, improvement, statistics,
         )  # fmt: skip
 
     def _failed(self, reason: str) -> SciRegistration:
         nan = float("nan")
         return SciRegistration(
-            self.start, False, (reason,), tuple(self.turns), 0.0, nan, nan, None, np.empty(0), nan, (nan, nan), {}
+            self.start, False, (reason,), tuple(self.turns), 0.0, nan, nan, None, 0, nan, (nan, nan), {}
         )
 
     def _predicted_error(self, view: View, covariance: Covariance) -> float:
@@ -363,38 +399,36 @@ class _Loop:
         return float(np.sqrt(variances.mean())) if len(rows) else float("nan")
 
     def _confirmed(self, view: View) -> tuple[float, float, float, int]:
-        """Templates of twice the area, searched a dozen pixels around one level up, that come back."""
+        """Patches of the photo, searched a dozen pixels around one level up, each for itself: how many come back."""
         scale = self.turns[-1].scale * (0.5 if self.turns[-1].scale * self.long_side > COARSEST else 1.0)
         radius, within = 12, 1.5
+        by_chance = float(np.pi * within**2 / (2 * radius + 1) ** 2)
         try:
-            found, _ = find_correspondences(
-                self.cloud, view, self.photo, scale, Search(half=16, radius=radius, cell=12, per_cell=1),
-                station=self.station, exponents=self.exponents,
-            )  # fmt: skip
-        except DegenerateError:
-            return 0.0, within / scale, 1.0, 0
-        by_chance = float(np.pi * within**2 / (2 * radius - 1) ** 2)
-        if found.templates == 0:
+            found = self._surfaces(view, scale, radius)
+        except (DegenerateError, _LoopError):
             return 0.0, within / scale, by_chance, 0
-        projected, _ = _core.project(view.core, found.xyz)
-        near = np.linalg.norm(projected - found.xy, axis=1) < within * found.pixel
-        searched = found.templates - found.outcomes["unknown"]
-        return float(near.sum() / max(searched, 1)), within / scale, by_chance, searched
+        wide, high = PATCHES if found.size[0] >= found.size[1] else PATCHES[::-1]
+        share = found.places * found.scale / found.size
+        patch = (share[:, 1] * high).astype(int) * wide + (share[:, 0] * wide).astype(int)
+        surfaces = found.log_likelihood()
+        back = []
+        for k in range(wide * high):
+            mine = surfaces[patch == k]
+            if len(mine) >= 4:
+                row, column = np.divmod(int(np.argmax(mine.sum(0))), 2 * radius + 1)
+                back.append(np.hypot(row - radius, column - radius) <= within)
+        return float(np.mean(back)) if back else 0.0, within / scale, by_chance, len(back)
 
     def _improvement(self, view: View) -> tuple[float, float]:
         """Mean likeness without a shift at the result less that at the start, and its standard error."""
-        scale, search = self.turns[-1].scale, Search(radius=2)
         likeness = []
         for v in (self.start, view):
             try:
-                found, _ = find_correspondences(
-                    self.cloud, v, self.photo, scale, search, station=self.station, exponents=self.exponents
-                )
-            except DegenerateError:
-                return (float("inf"), 0.0)
-            likeness.append(found.here)
+                likeness.append(self._surfaces(v, self.turns[-1].scale, 2).here)
+            except (DegenerateError, _LoopError):
+                likeness.append(np.empty(0))
         a, b = likeness
-        if len(a) < 10 or len(b) < 10:
+        if len(a) == 0 or len(b) == 0:
             return (float("inf") if len(b) > len(a) else float("-inf"), 0.0)
         return float(b.mean() - a.mean()), float(np.sqrt(a.var() / len(a) + b.var() / len(b)))
 

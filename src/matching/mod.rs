@@ -20,4 +20,4 @@ pub use information::{Information, InformationPhoto, information_distance};
 pub use interest::{Interest, InterestOptions, interest_points};
 pub use plane::Plane;
 pub use relief::relief;
-pub use template::{Features, Match, Measure, Outcome, TemplateOptions, match_templates};
+pub use template::{Features, Match, Measure, Outcome, Scores, TemplateOptions, match_templates, score_templates};

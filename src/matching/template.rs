@@ -186,6 +186,17 @@ pub fn match_templates(
     points: &[[usize; 2]],
     options: &TemplateOptions,
 ) -> Result<Vec<Match>> {
+    let (taper, fourier) = prepared(sci, photo, options)?;
+    let rows: Result<Vec<Vec<Match>>> = points
+        .par_iter()
+        .enumerate()
+        .map(|(i, p)| search_one(sci, photo, i, *p, options, &taper, fourier.as_ref()))
+        .collect();
+    Ok(rows?.into_iter().flatten().collect())
+}
+
+/// The taper of the templates, and the transform where it is the quicker way.
+fn prepared(sci: &Features, photo: &Features, options: &TemplateOptions) -> Result<(Vec<f32>, Option<Fourier>)> {
     let (found, wanted) = (photo.size(), sci.size());
     if found != wanted {
         return Err(Error::invalid(format!(
@@ -203,16 +214,10 @@ pub fn match_templates(
         )));
     }
     let side = 2 * options.half + 1;
-    let taper = taper(options.half);
     let window = side + 2 * options.radius;
     let fourier =
         by_spectra_is_quicker(side, options.radius, sci.stack.planes.len()).then(|| Fourier::at_least(window, window));
-    let rows: Result<Vec<Vec<Match>>> = points
-        .par_iter()
-        .enumerate()
-        .map(|(i, p)| search_one(sci, photo, i, *p, options, &taper, fourier.as_ref()))
-        .collect();
-    Ok(rows?.into_iter().flatten().collect())
+    Ok((taper(options.half), fourier))
 }
 
 /// Multiplications of the sums against those of the transforms, whose constant was measured.
@@ -245,23 +250,67 @@ fn search_one(
     taper: &[f32],
     fourier: Option<&Fourier>,
 ) -> Result<Vec<Match>> {
+    Ok(match surface(sci, photo, point, options, taper, fourier)? {
+        Some((surface, samples)) => judge(&surface, samples, index, options),
+        None => vec![Match::refused(index, Outcome::Unknown, f32::NAN)],
+    })
+}
+
+/// The scores of one template at all shifts and its number of independent pixels; `None` where too little is known.
+fn surface(
+    sci: &Features,
+    photo: &Features,
+    point: [usize; 2],
+    options: &TemplateOptions,
+    taper: &[f32],
+    fourier: Option<&Fourier>,
+) -> Result<Option<(Surface, f64)>> {
     let at = Placement { x: point[0], y: point[1], half: options.half, radius: options.radius, least_overlap: 0.6 };
-    let refused = |outcome| Ok(vec![Match::refused(index, outcome, f32::NAN)]);
     let measure = sci.measure;
     let (sci, photo) = (&sci.stack, &photo.stack);
     let (surface, pixels) = match measure {
         Measure::MutualInformation(bins) => match mutual::search(sci, photo, &at, bins, options.least_known) {
             Some((surface, pixels, known)) if known >= options.least_known => (surface, pixels),
-            _ => return refused(Outcome::Unknown),
+            _ => return Ok(None),
         },
         _ => match Template::cut(sci, &at, taper) {
             Some(template) if template.known() >= options.least_known => {
                 (template.search(photo, &at, fourier)?, template.pixels())
             }
-            _ => return refused(Outcome::Unknown),
+            _ => return Ok(None),
         },
     };
-    Ok(judge(&surface, f64::from(pixels) / independent_area(&measure), index, options))
+    Ok(Some((surface, f64::from(pixels) / independent_area(&measure))))
+}
+
+/// The scores of a template at all its shifts.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Scores {
+    /// (2 radius + 1)² scores, row by row from the shift (−radius, −radius); NaN where too little is known.
+    pub scores: Vec<f32>,
+    /// The number of independent pixels that each stands on; 0 where the template is not known.
+    pub samples: f64,
+}
+
+/// The whole score surfaces of templates, for an estimate that takes them together: edges, which fix a shift in one
+/// direction only, and repetitions, which no single template can tell apart, then help and do not mislead.
+pub fn score_templates(
+    sci: &Features,
+    photo: &Features,
+    points: &[[usize; 2]],
+    options: &TemplateOptions,
+) -> Result<Vec<Scores>> {
+    let (taper, fourier) = prepared(sci, photo, options)?;
+    let side = 2 * options.radius + 1;
+    points
+        .par_iter()
+        .map(|p| {
+            Ok(match surface(sci, photo, *p, options, &taper, fourier.as_ref())? {
+                Some((surface, samples)) => Scores { scores: surface.scores, samples },
+                None => Scores { scores: vec![f32::NAN; side * side], samples: 0.0 },
+            })
+        })
+        .collect()
 }
 
 /// Pixels that share one independent value: 4π σ² of what was blurred.

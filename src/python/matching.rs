@@ -43,6 +43,24 @@ fn resize<'py>(
     owned(py, out.values, [height, width])
 }
 
+#[pyfunction]
+#[pyo3(signature = (image, known, sigma))]
+fn masked_blur<'py>(
+    py: Python<'py>,
+    image: &Bound<'py, PyAny>,
+    known: Option<&Bound<'py, PyAny>>,
+    sigma: f32,
+) -> PyResult<Bound<'py, PyArray2<f32>>> {
+    let (image, known) = (plane(image, "image")?, mask(known)?);
+    if let Some(known) = &known
+        && !known.same_size(&image)
+    {
+        return Err(Error::invalid("the mask has not the size of its image").into());
+    }
+    let out = py.detach(|| matching::channels::masked_blur(&image, known.as_ref(), sigma));
+    owned(py, out.values, [image.height, image.width])
+}
+
 #[pyclass(frozen, name = "Features", module = "colourreg_rs._core")]
 pub(super) struct PyFeatures(Features);
 
@@ -168,6 +186,27 @@ fn match_templates<'py>(
     Ok(out)
 }
 
+type Surfaces<'py> = (Bound<'py, PyArray1<f32>>, Bound<'py, PyArray1<f64>>);
+
+#[pyfunction]
+#[pyo3(signature = (sci, photo, points, *, half=12, radius=4, least_known=0.5))]
+fn score_templates<'py>(
+    py: Python<'py>,
+    sci: &PyFeatures,
+    photo: &PyFeatures,
+    points: &Bound<'py, PyAny>,
+    half: usize,
+    radius: usize,
+    least_known: f32,
+) -> PyResult<Surfaces<'py>> {
+    let input = Input::<i64>::new(points, "points", &[None, Some(2)])?;
+    let places = places(input.rows::<2>()?);
+    let options = TemplateOptions { half, radius, least_known, ..TemplateOptions::default() };
+    let found = py.detach(|| matching::score_templates(&sci.0, &photo.0, &places, &options))?;
+    let samples = PyArray1::from_iter(py, found.iter().map(|s| s.samples));
+    Ok((PyArray1::from_iter(py, found.iter().flat_map(|s| s.scores.iter().copied())), samples))
+}
+
 #[pyfunction]
 fn relief<'py>(
     py: Python<'py>,
@@ -224,6 +263,8 @@ pub(super) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(resize, m)?)?;
     m.add_function(wrap_pyfunction!(interest_points, m)?)?;
     m.add_function(wrap_pyfunction!(match_templates, m)?)?;
+    m.add_function(wrap_pyfunction!(masked_blur, m)?)?;
+    m.add_function(wrap_pyfunction!(score_templates, m)?)?;
     m.add_function(wrap_pyfunction!(relief, m)?)?;
     m.add_function(wrap_pyfunction!(information_distance, m)?)?;
     m.add_function(wrap_pyfunction!(rank, m)?)

@@ -80,7 +80,7 @@ def test_the_covariance_meets_the_scatter_of_correlated_matches(rng):
         root = np.linalg.cholesky(np.exp(-0.5 * square / length**2) + 0.05 * np.eye(n))
         noisy = xy + sigma * root @ rng.normal(size=(n, 2))
         stated = np.broadcast_to(np.eye(2) * sigma**2, (n, 2, 2)).copy()
-        fit = _core.resect(view.core, xyz, noisy, sigma_xy=stated, loss="tukey", start="given")
+        fit = _core.resect(view.core, xyz, noisy, sigma_xy=stated, start="given")
         found = View("f", None, camera, Pose(fit.view.rotation, fit.view.translation))
         turn = cv2.Rodrigues(found.pose.rotation.T)[0].ravel()
         error = np.concatenate([turn, -found.pose.centre])

@@ -2,50 +2,35 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 import pytest
 
 from colourreg_rs import Camera, InvalidInputError, PointCloud, Pose, View, _core
+from colourreg_rs.experiments.sci_accuracy import STARTS, disturbed, register, simulated
 from colourreg_rs.match_covariance import design, match_covariance
 from colourreg_rs.register_sci import SciOptions, register_sci
-from colourreg_rs.sci import render_sci, with_size
-
-
-def disturbed(view: View, rng: np.random.Generator, degrees: float, metres: float) -> View:
-    """The view turned about a random axis and moved in a random direction, by so much."""
-    turn, shift = rng.normal(size=3), rng.normal(size=3)
-    rotation = cv2.Rodrigues(turn / np.linalg.norm(turn) * np.radians(degrees))[0] @ view.pose.rotation
-    u, _, v = np.linalg.svd(rotation)
-    return replace(view, pose=Pose.from_centre(u @ v, view.pose.centre + shift / np.linalg.norm(shift) * metres))
-
-
-def pixel_errors(found: View, truth: View, cloud: PointCloud) -> np.ndarray:
-    """Distances in the photo over the points that it sees, px."""
-    sci = render_sci(cloud, with_size(truth, 480, round(480 * truth.camera.height / truth.camera.width)))
-    xyz = np.ascontiguousarray(cloud.xyz[sci.index[sci.measured]])
-    return np.linalg.norm(_core.project(found.core, xyz)[0] - _core.project(truth.core, xyz)[0], axis=1)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("degrees, metres", [(0.5, 0.02), (3.0, 0.2)])
-def test_a_facade_is_registered_to_a_fraction_of_a_pixel(degrees, metres, rng):
-    from colourreg_rs.simulate import simulate
+@pytest.mark.parametrize("scene", ["facade", "room"])
+def test_photos_are_registered_to_a_fraction_of_a_pixel(scene):
+    """One of each kind from both starts; the table over many is that of ``experiments.sci_accuracy``."""
+    case = simulated(scene, 0, (1200, 800))
+    for degrees, metres in STARTS:
+        outcome, result = register(case, degrees, metres)
+        assert outcome.trusted, outcome.reasons
+        assert outcome.error < 0.5 < 0.1 * outcome.start
+        assert result.used > 100 and result.confirmed >= 0.4 > 10 * result.by_chance
+        assert outcome.error < 3 * outcome.predicted and outcome.predicted < 1.0
 
-    simulation = simulate("facade", seed=0, photos=1, size=(1500, 1000), samples=4)
-    photo = simulation.photos[0]
-    start = disturbed(photo.view, rng, degrees, metres)
-    result = register_sci(simulation.scan, photo.image, start, SciOptions(station=simulation.stations[0]))
-    assert result.trusted, result.reasons
-    errors = pixel_errors(result.view, photo.view, simulation.scan)
-    assert np.sqrt((errors**2).mean()) < 0.5
-    assert result.used > 200 and result.confirmed > 0.25 > 10 * result.by_chance
-    assert 0.02 < result.predicted_error < 0.5
-    # Somebody else's photo is no registration.
-    other = np.ascontiguousarray(photo.image[::-1, ::-1])
-    wrong = register_sci(simulation.scan, other, start, SciOptions(station=simulation.stations[0]))
+
+@pytest.mark.slow
+def test_somebody_elses_photo_is_no_registration(rng):
+    case = simulated("facade", 0, (1200, 800))
+    other = np.ascontiguousarray(case.image[::-1, ::-1])
+    start = disturbed(case.truth, rng, 0.5, 0.02)
+    wrong = register_sci(case.scan, other, start, SciOptions(station=case.station))
     assert not wrong.trusted and wrong.reasons and wrong.view is start
 
 

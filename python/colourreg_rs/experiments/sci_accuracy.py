@@ -216,7 +216,9 @@ def main() -> None:
     width, height = (int(n) for n in arguments.size.split("x"))
     outcomes = []
     print(HEADER, flush=True)
-    for outcome in run(arguments.scene or ["facade", "room"], _seeds(arguments.seeds), (width, height), arguments.cache):
+    for outcome in run(
+        arguments.scene or ["facade", "room"], _seeds(arguments.seeds), (width, height), arguments.cache
+    ):
         print(line(outcome), flush=True)
         for reason in outcome.reasons:
             print(f"    {reason}", flush=True)

@@ -1,0 +1,190 @@
+"""How fast is a synthetic camera image of 10 million points in 12 megapixels, against NumPy and numba?
+
+The job: project all points with distortion, keep the nearest in each pixel, and give its depth and its intensity; once
+with footprints of one pixel and once so that near surfaces hide what shines through between their points. For the
+latter NumPy and numba write each point into 3 x 3 pixels; colourreg finds the surfaces between the points, which also
+holds where gaps are wider than that. Points in the order of the scan and shuffled. All contenders run in turn in
+processes of their own on the same input; numba's compilation is not timed, nor is anybody's import. Depths are compared with
+NumPy's. Limits: a made-up building of walls at four distances; a machine that does other things moves all figures, the
+ratios less.
+
+    python -m benches.peers.sci [--points 10000000] [--repeats 3]
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import time
+
+import numpy as np
+
+from .harness import compare, parser
+
+WIDTH, HEIGHT = 4000, 3000
+PARAMS = {
+    "fx": 2900.0, "fy": 2900.0, "cx": 1999.5, "cy": 1499.5, "k1": -0.05, "k2": 0.01, "p1": 5e-4, "p2": -3e-4, "k3": 0.0,
+}  # fmt: skip
+
+
+def cloud(points, order):
+    """Walls, each nearer one before a part of the farther ones, scanned in columns: (N, 3) camera frame, intensity."""
+    rng = np.random.default_rng(1)
+    rows = int(np.sqrt(points * 3 / 4))
+    x, y = np.meshgrid(np.linspace(-0.72, 0.72, points // rows), np.linspace(-0.54, 0.54, rows), indexing="ij")
+    x, y = x.ravel(), y.ravel()
+    depth = 8.0 + 6.0 * (np.floor(9 * (x + 0.72)).astype(int) % 4) + 0.2 * np.floor(20 * y)
+    depth += rng.normal(0, 0.002, len(depth))
+    xyz = np.stack([x * depth, y * depth, depth], axis=1)
+    intensity = rng.integers(0, 65535, len(xyz)).astype(np.float32)
+    if order == "shuffled":
+        mixed = rng.permutation(len(xyz))
+        xyz, intensity = xyz[mixed], intensity[mixed]
+    return np.ascontiguousarray(xyz), intensity
+
+
+def view():
+    from colourreg_rs import Camera, Pose, View
+
+    return View("v", None, Camera("OPENCV", WIDTH, HEIGHT, PARAMS), Pose(np.eye(3), np.zeros(3)))
+
+
+def project(xyz):
+    """In NumPy, as one writes it: pixels and depth."""
+    p = PARAMS
+    z = xyz[:, 2]
+    x, y = xyz[:, 0] / z, xyz[:, 1] / z
+    r2 = x * x + y * y
+    radial = 1 + r2 * (p["k1"] + r2 * p["k2"])
+    u = x * radial + 2 * p["p1"] * x * y + p["p2"] * (r2 + 2 * x * x)
+    v = y * radial + p["p1"] * (r2 + 2 * y * y) + 2 * p["p2"] * x * y
+    return p["fx"] * u + p["cx"], p["fy"] * v + p["cy"], z
+
+
+def by_numpy(xyz, intensity, footprint):
+    u, v, z = project(xyz)
+    column, row = np.rint(u).astype(np.int64), np.rint(v).astype(np.int64)
+    depth = np.full(WIDTH * HEIGHT, np.inf)
+    reach = footprint // 2
+    shifts = [(i, j) for j in range(-reach, reach + 1) for i in range(-reach, reach + 1)]
+    cells = []
+    for i, j in shifts:
+        ok = (column + i >= 0) & (column + i < WIDTH) & (row + j >= 0) & (row + j < HEIGHT) & (z > 0)
+        cell = (row[ok] + j) * WIDTH + column[ok] + i
+        np.minimum.at(depth, cell, z[ok])
+        cells.append((cell, ok))
+    grey = np.zeros(WIDTH * HEIGHT, np.float32)
+    for cell, ok in cells:
+        front = depth[cell] == z[ok]
+        grey[cell[front]] = intensity[ok][front]
+    return depth.reshape(HEIGHT, WIDTH), grey.reshape(HEIGHT, WIDTH)
+
+
+def by_colourreg(xyz, intensity, footprint):
+    from colourreg_rs import _core
+
+    core = view().core
+    buffer = _core.IndexBuffer(core)
+    buffer.add(xyz)
+    if footprint == 1:
+        depth, index = buffer.images()
+    else:
+        index, inverse, _ = _core.sci_front(buffer)
+        with np.errstate(divide="ignore"):
+            depth = np.divide(1.0, inverse, out=inverse)
+    grey = intensity[index]  # -1 takes the last one, which the next line takes out
+    grey[index < 0] = 0
+    return depth, grey
+
+
+def numba_kernels():
+    import numba
+
+    p = {k: float(v) for k, v in PARAMS.items()}
+    fx, fy, cx, cy, k1, k2, p1, p2 = (p[k] for k in ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"))
+
+    @numba.njit(parallel=True, fastmath=True)
+    def draw(xyz, intensity, reach, depths, greys):
+        workers = depths.shape[0]
+        n = len(xyz)
+        for w in numba.prange(workers):
+            depth, grey = depths[w], greys[w]
+            for i in range(w * n // workers, (w + 1) * n // workers):
+                z = xyz[i, 2]
+                if z <= 0:
+                    continue
+                x, y = xyz[i, 0] / z, xyz[i, 1] / z
+                r2 = x * x + y * y
+                radial = 1 + r2 * (k1 + r2 * k2)
+                c = int(np.rint(fx * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)) + cx))
+                r = int(np.rint(fy * (y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y) + cy))
+                for v in range(max(r - reach, 0), min(r + reach + 1, HEIGHT)):
+                    for u in range(max(c - reach, 0), min(c + reach + 1, WIDTH)):
+                        if z < depth[v, u]:
+                            depth[v, u] = z
+                            grey[v, u] = intensity[i]
+        for v in numba.prange(HEIGHT):
+            for w in range(1, workers):
+                for u in range(WIDTH):
+                    if depths[w, v, u] < depths[0, v, u]:
+                        depths[0, v, u] = depths[w, v, u]
+                        greys[0, v, u] = greys[w, v, u]
+
+    def run(xyz, intensity, footprint):
+        workers = numba.get_num_threads()
+        depths = np.full((workers, HEIGHT, WIDTH), np.inf, np.float32)
+        greys = np.zeros((workers, HEIGHT, WIDTH), np.float32)
+        draw(xyz, intensity, footprint // 2, depths, greys)
+        return depths[0], greys[0]
+
+    return run
+
+
+def _timed(run, points, order, footprint, check=False):
+    xyz, intensity = cloud(int(points), order)
+    begin = time.perf_counter()
+    depth, _ = run(xyz, intensity, int(footprint))
+    seconds = time.perf_counter() - begin
+    if check:
+        # Pixels at whose border a point lies may go to the neighbour by rounding.
+        want, _ = by_numpy(xyz, intensity, 1)
+        seen = np.isfinite(want) & np.isfinite(depth)
+        assert seen.sum() > 0.99 * np.isfinite(want).sum(), "other pixels than NumPy's are seen"
+        assert (np.abs(depth[seen] - want[seen]) < 1e-4 * want[seen]).mean() > 0.999, "other depths than NumPy's"
+    return seconds
+
+
+def colourreg(points, order, footprint):
+    return _timed(by_colourreg, points, order, footprint, check=int(points) <= 2_000_000 and footprint == "1")
+
+
+def numpy_minimum_at(points, order, footprint):
+    return _timed(by_numpy, points, order, footprint)
+
+
+def numba_private_buffers(points, order, footprint):
+    run = numba_kernels()
+    run(np.ones((10, 3)), np.ones(10, np.float32), 1)
+    return _timed(run, points, order, footprint)
+
+
+def main() -> None:
+    arguments = parser((__doc__ or "").splitlines()[0]).parse_args()
+    contenders = {"colourreg": colourreg, "numpy minimum.at": numpy_minimum_at}
+    if importlib.util.find_spec("numba"):
+        contenders["numba"] = numba_private_buffers
+    else:
+        print("numba is not installed and left out")
+    ours = {}
+    for footprint in ("1", "3"):
+        for order in ("scan", "shuffled"):
+            what = "one pixel" if footprint == "1" else "3 x 3 pixels, colourreg: surfaces"
+            print(f"\n{arguments.points:,} points in {WIDTH} x {HEIGHT}, footprints of {what}, in {order} order")
+            figures = compare(contenders, [str(arguments.points), order, footprint], arguments.repeats)
+            ours[footprint, order] = figures[0].seconds
+    for footprint in ("1", "3"):
+        ratio = ours[footprint, "shuffled"] / ours[footprint, "scan"]
+        print(f"shuffled / in order, footprint {footprint}: {ratio:.2f}")
+
+
+if __name__ == "__main__":
+    main()

@@ -4,7 +4,7 @@ The job: project all points with distortion, keep the nearest in each pixel, and
 with footprints of one pixel and once so that near surfaces hide what shines through between their points. For the
 latter NumPy and numba write each point into 3 x 3 pixels; colourreg finds the surfaces between the points, which also
 holds where gaps are wider than that. Points in the order of the scan and shuffled. All contenders run in turn in
-processes of their own on the same input; numba's compilation is not timed, nor is anybody's import. Depths are compared with
+processes of their own on the same input; numba's compilation is not timed, nor is any import. Depths are compared with
 NumPy's. Limits: a made-up building of walls at four distances; a machine that does other things moves all figures, the
 ratios less.
 

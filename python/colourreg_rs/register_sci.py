@@ -3,8 +3,8 @@
 The SCI is rendered at the current view and matched with the photo; resection gives the next view; and the SCI is
 rendered again, until the view stands still. Coarse to fine: at the coarsest level templates span many degrees, are
 searched over the whole of the start's uncertainty, each for itself, and a robust resection takes those that agree; from
-there on all templates are taken together (:mod:`.surfaces`). The single pass of Forkuo and King is the first turn alone,
-at the finest level.
+there on all templates are taken together (:mod:`.surfaces`). The single pass of Forkuo and King is the first turn
+alone, at the finest level.
 
 A result is believed only if the patches of the photo, each searched far beyond its own noise, come back to where they
 were (``confirmed``); one that is not is returned as a failure, with the figures that say so.
@@ -34,8 +34,8 @@ from .model import Covariance, FloatArray, PointCloud, Pose, View
 from .sci import SCI
 from .surfaces import Linearised, Surfaces, find_surfaces, joined
 
-#: The finest level has this many pixels per spacing of the points: matches err by a share of the level's pixel, whatever
-#: the spacing, since points count at their own places in the pixels.
+#: The finest level has this many pixels per spacing of the points: matches err by a share of the level's pixel,
+#: whatever the spacing, since points count at their own places in the pixels.
 OVERSAMPLING = 3.0
 
 #: The coarsest level has about this many pixels along the long side.

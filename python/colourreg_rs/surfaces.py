@@ -1,8 +1,8 @@
 """All templates of an SCI taken together: the view at which their likenesses to the photo are largest in sum.
 
 A template on a straight edge fixes its shift across the edge alone, one on a row of equal windows fits at several
-shifts; searched one by one they are refused or err. Taken together they need not decide: each keeps its whole surface of
-scores over the shifts, and the view is moved until the sum of their log-likelihoods, ``-n/2 log(1 - ρ²)`` of the
+shifts; searched one by one they are refused or err. Taken together they need not decide: each keeps its whole surface
+of scores over the shifts, and the view is moved until the sum of their log-likelihoods, ``-n/2 log(1 - ρ²)`` of the
 correlation ρ over n independent pixels, is largest. It saturates by itself: what looks nowhere alike has no slope.
 Source of the idea: constrained local models (Saragih, Lucey and Cohn 2011), with a camera in place of a face.
 """
@@ -82,7 +82,7 @@ class Surfaces:
     @property
     def radius(self) -> int:
         """The largest shift, px of the level."""
-        return self.scores.shape[1] // 2
+        return int(self.scores.shape[1]) // 2
 
     @property
     def here(self) -> FloatArray:
@@ -194,7 +194,7 @@ def _laid_out(
     columns, rows = np.arange(half + right, width - half, apart), np.arange(half + down, height - half, apart)
     points = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2).astype(np.int64)
     by_row, by_column = np.gradient(image)
-    energy = (by_row**2 + by_column**2).astype(np.float32)
+    energy: Float32Array = np.asarray(by_row**2 + by_column**2, dtype=np.float32)
     strength = _core.masked_blur(energy, known, 0.5 * half)[points[:, 1], points[:, 0]]
     depth = np.where(sci.seen, sci.depth, np.inf)
     nearest = _minimum(_minimum(depth, REACH).T, REACH).T[points[:, 1], points[:, 0]].astype(np.float64)

@@ -29,11 +29,15 @@ from .correspondences import (
     supported_scale,
 )
 from .errors import DegenerateError
-from .match_covariance import CORRELATION_LENGTH, TUKEY, design
+from .match_covariance import design
 from .model import FloatArray, PointCloud, View
 
 #: Significance of the test of the field.
 ALPHA = 0.01
+#: Of Tukey's biweight in two dimensions, as in the resection.
+TUKEY = 5.123
+#: The distance over which matches err together, as one sigma of a Gaussian and a share of the photo's long side.
+CORRELATION_LENGTH = 0.06
 #: What the method is off by in common, px of the synthetic image, one sigma in x and in y (and, of rotation and scale,
 #: at half the photo's width): of cloud and photo, whose light differs, and of two photos. Found on 62 right views of
 #: simulated scenes; it keeps the level of the test on others.

@@ -82,15 +82,14 @@ def simulated(scene: str, seed: int, size: tuple[int, int], cache: Path | None =
 
     file = None if cache is None else cache / f"{scene}-{seed}-{size[0]}x{size[1]}.pickle"
     if file is not None and file.exists():
-        case: Case = pickle.loads(file.read_bytes())
-        return case
+        return Case(scene, seed, *pickle.loads(file.read_bytes()))
     made = simulate(scene, seed=seed, photos=1, size=size, samples=4)
     photo = made.photos[0]
-    case = Case(scene, seed, made.scan, photo.image, replace(photo.view), made.stations[0])
+    parts = (made.scan, photo.image, replace(photo.view), made.stations[0])
     if file is not None:
         file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_bytes(pickle.dumps(case))
-    return case
+        file.write_bytes(pickle.dumps(parts))
+    return Case(scene, seed, *parts)
 
 
 def disturbed(view: View, rng: np.random.Generator, degrees: float, metres: float) -> View:

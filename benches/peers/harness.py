@@ -1,12 +1,14 @@
 """One measurement: every contender in a process of its own, in turn, so that all see the same machine.
 
-A contender is a function of this package that does its untimed preparation, then returns the seconds of the timed part.
+A contender is a function of this package that does its untimed preparation, then returns the seconds of the timed part;
+with :func:`forget_peak` between the two the preparation does not count towards the peak either.
 Its peak memory is that of its process alone.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
 import json
 import resource
@@ -34,6 +36,12 @@ def peak_of_this_process() -> float:
             return next(float(line.split()[1]) for line in status if line.startswith("VmHWM")) / 1024
     except (OSError, StopIteration):
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def forget_peak() -> None:
+    """What was held until now no longer counts towards the peak, where the system can forget."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
 
 
 def run_once(function: Callable[..., float], arguments: Sequence[str]) -> tuple[float, float]:

@@ -1,9 +1,10 @@
 """How fast do 10 million points get their colours from 24 megapixels in memory: what hides what, then bilinear samples?
 
 Peers: the idiom that people paste together of NumPy and OpenCV (``projectPoints``, ``minimum.at``, tolerance of 1 %,
-``remap``), the same with a projection written in NumPy, and the same fused in a parallel numba kernel with a depth buffer for each thread. Both hide only what falls into the
-same pixel; colourreg makes surfaces of the points, so that walls hide what shines through between their points, which
-is more work. Each in a process of its own on the same input, as scanned and shuffled. Limits: the photo is made up.
+``remap``), the same with a projection written in NumPy, and the same fused in a parallel numba kernel with a depth
+buffer for each thread. They hide only what falls into the same pixel; colourreg makes surfaces of the points, so that
+walls hide what shines through between their points, which is more work. Each in a process of its own on the same input,
+as scanned and shuffled. Limits: the photo is made up.
 
     python -m benches.peers.colouring [--points 10000000] [--repeats 3]
 """

@@ -5,7 +5,7 @@ use rayon::prelude::*;
 
 use crate::error::{Error, Result};
 use crate::geometry::{Block, BlockProjector, Depth, Frustum, LANES, Model, View};
-use crate::render::{DepthBuffer, Footprint, Located, Surfaces};
+use crate::render::{DepthBuffer, Footprint, Located, Sample, Surfaces, clamped};
 
 /// Points per task of the scheduler.
 const TASK: usize = 16 * LANES;
@@ -15,6 +15,9 @@ const REACH: usize = 4;
 const FLATNESS: f32 = 0.01;
 /// A step of this much, relative, is a depth edge.
 const EDGE: f32 = 0.05;
+/// The part of a pixel that surfaces have to cover to hide a point in it. Less than half, since a point that is coloured
+/// wrongly does more harm than one that is not coloured.
+const COVERED: f32 = 0.5;
 /// The part of the photo's width in which a weight rises from the border.
 const BORDER: f64 = 0.03;
 
@@ -88,10 +91,10 @@ impl VisibilityMap {
     /// The nearest depth in each pixel of the photo, row by row; NaN where there is no point.
     pub fn depth(&self) -> Vec<f32> {
         let grid = &self.surfaces.grid;
-        let pixel = |&inverse: &f32| if inverse > 0.0 { 1.0 / inverse } else { f32::NAN };
+        let pixel = |sample: &Sample| if sample.found() { 1.0 / sample.inverse_depth() } else { f32::NAN };
         (0..grid.height)
             .into_par_iter()
-            .flat_map_iter(|row| grid.photo_row(&self.surfaces.inverse_depth, row).iter().map(pixel))
+            .flat_map_iter(|row| grid.photo_row(&self.surfaces.samples, row).iter().map(pixel))
             .collect()
     }
 
@@ -134,7 +137,7 @@ impl VisibilityMap {
         for i in 0..points.len() {
             crate::render::fetch(limit, sight.located.ahead(i));
             if let Some((cell, inverse)) = sight.located.get(i)
-                && inverse < limit[cell]
+                && self.hidden(cell, clamped(inverse), sight.block.x[i], sight.block.y[i])
             {
                 sight.located.drop(i);
             }
@@ -142,6 +145,25 @@ impl VisibilityMap {
         if self.limits != Limits::default() {
             self.refuse(points, sight);
         }
+    }
+
+    /// Whether a point of this inverse depth lies behind a surface: by the four cells around it, as in bilinear
+    /// interpolation, so that edges run between pixels and not along them.
+    #[inline(always)]
+    fn hidden(&self, cell: usize, inverse: f32, x: f64, y: f64) -> bool {
+        let limit = &self.surfaces.limit;
+        let (right, down) = ((x + 0.5).fract() as f32 - 0.5, (y + 0.5).fract() as f32 - 0.5);
+        let beside = if right < 0.0 { cell - 1 } else { cell + 1 };
+        let stride = self.surfaces.grid.stride();
+        let above = if down < 0.0 { cell - stride } else { cell + stride };
+        let across = above + beside - cell;
+        let (a, b) = (right.abs(), down.abs());
+        let weight = |cell: usize, weight: f32| if inverse < limit[cell] { weight } else { 0.0 };
+        weight(cell, (1.0 - a) * (1.0 - b))
+            + weight(beside, a * (1.0 - b))
+            + weight(above, (1.0 - a) * b)
+            + weight(across, a * b)
+            > COVERED
     }
 
     #[cold]
@@ -163,15 +185,18 @@ impl VisibilityMap {
     /// The derivative of the inverse depth by one step of the grid: from the nearest two samples opposite each other
     /// that lie on one line with this one. Zero where there are none.
     fn slope(&self, cell: usize, step: usize) -> f32 {
-        let samples = &self.surfaces.inverse_depth;
-        let own = samples[cell];
+        let samples = &self.surfaces.samples;
+        let own = samples[cell].inverse_depth();
         for k in 1..=REACH {
             if cell < k * step {
                 break;
             }
-            let (Some(&a), Some(&b)) = (samples.get(cell + k * step), samples.get(cell - k * step)) else { break };
-            if a > 0.0 && b > 0.0 && (a + b - 2.0 * own).abs() <= 2.0 * FLATNESS * own {
-                return (a - b) / (2 * k) as f32;
+            let (Some(a), Some(b)) = (samples.get(cell + k * step), samples.get(cell - k * step)) else { break };
+            if a.found() && b.found() {
+                let (a, b) = (a.inverse_depth(), b.inverse_depth());
+                if (a + b - 2.0 * own).abs() <= 2.0 * FLATNESS * own {
+                    return (a - b) / (2 * k) as f32;
+                }
             }
         }
         0.0
@@ -188,7 +213,7 @@ impl VisibilityMap {
             }
         }
         let camera = &self.view.camera;
-        let own = f64::from(self.surfaces.inverse_depth[cell]);
+        let own = f64::from(self.surfaces.samples[cell].inverse_depth());
         let stride = self.surfaces.grid.stride();
         let (gx, gy) = (f64::from(self.slope(cell, 1)), f64::from(self.slope(cell, stride)));
         let q = self.view.pose.transform(p);
@@ -229,12 +254,12 @@ impl VisibilityMap {
 
     /// Whether the depth steps within three cells.
     fn near_an_edge(&self, cell: usize) -> bool {
-        let samples = &self.surfaces.inverse_depth;
-        let own = samples[cell];
+        let depth =
+            |cell: usize| self.surfaces.samples.get(cell).filter(|s| s.found()).map_or(0.0, |s| s.inverse_depth());
+        let own = depth(cell);
         let stride = self.surfaces.grid.stride();
         [3, 3 * stride, 2 + 2 * stride, 2 * stride - 2].iter().any(|&step| {
-            let a = samples.get(cell + step).copied().unwrap_or(0.0);
-            let b = cell.checked_sub(step).map_or(0.0, |c| samples[c]);
+            let (a, b) = (depth(cell + step), cell.checked_sub(step).map_or(0.0, depth));
             // On one surface, however slanted, the two lie on a line with the middle.
             let stepped = |v: f32| v > 0.0 && (v - own).abs() > EDGE * own;
             let straight = a > 0.0 && b > 0.0 && (a + b - 2.0 * own).abs() <= EDGE * own;

@@ -1,45 +1,48 @@
 //! Which surfaces hide what lies behind them, found from the merged depth buffer alone.
 //!
-//! A scan is points, not surfaces: between the points of a near wall the far façade shows. Where the wall's points lie
-//! *around* a place, the wall covers it; where they lie on one side only, the place is beside the wall. So a place is
-//! covered as deep as the shallowest of two samples that lie opposite each other about it, seen in at least two
-//! directions. On a slanted surface one of two opposite samples is never in front of the place between them, so that
-//! a surface seen at a grazing angle does not hide itself; and beyond a straight edge there are no opposite samples, so
-//! that surfaces do not grow.
+//! A scan is points, not surfaces: between the points of a near wall the far façade shows. Each sample of the buffer
+//! looks for its nearest neighbours *on its own surface*, one in each of four quadrants ([`super::links`]). They give
+//! the local plane (the inverse depth of a plane is an affine function of the undistorted pixel position), the local
+//! spacing, and how far the sample covers the picture in each direction: to the neighbour where there is one, half a
+//! spacing where the surface ends. In that footprint the plane, not the sample's own depth, is what hides: a surface
+//! seen at a grazing angle neither hides itself nor lets anything shine through, and an edge does not bleed.
 //!
-//! How far apart opposite samples may lie follows the samples' own spacing: a pyramid of buffers, each with cells twice
-//! as wide, where a sample that has neighbours on its own surface in two directions goes up no more than one level.
-//! "Its own surface": three samples in a row whose inverse depths lie on a line, since the inverse depth of a plane is
-//! an affine function of the pixel position.
-//!
-//! Everything here is a function of the merged buffer: chunks, their order and threads cannot be seen in it. The idea of
-//! judging a point by the sectors in which samples lie before it is that of Pintus, Gobbetti and Agus, Real-time
-//! rendering of massive unstructured raw point clouds using screen-space operators, 2011.
+//! Everything here is a function of the merged buffer: chunks, their order and threads cannot be seen in it.
+
+use std::sync::Mutex;
 
 use rayon::prelude::*;
 
-use super::zbuffer::{DepthBuffer, Grid, PAD};
+use super::links::{Links, Patch, Pyramid, QUADRANTS, Surroundings};
+use super::sample::Sample;
+use super::zbuffer::{DepthBuffer, Grid};
 use crate::error::{Error, Result};
 use crate::geometry::View;
 
-/// How surfaces are told from gaps, and how much in front "in front" is.
+/// How surfaces are told from gaps, and how much in front "in front" is. The defaults were set on simulated scans, where
+/// they lose about as many visible points as they pass hidden ones.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Footprint {
-    /// Noise of the depths, relative: what is in front by less hides nothing.
-    pub tolerance: f32,
-    /// The tangent of the steepest incidence at which a surface of unknown slope is expected.
-    pub roughness: f32,
-    /// How many cells along the local slope count as the same place.
-    pub slope_cells: f32,
-    /// How far from a line, relative, three samples of one surface may lie.
-    pub flatness: f32,
-    /// The widest cell, as a power of two pixels.
-    pub max_level: usize,
+    /// What is in front by less than this part of the depth hides nothing; `None` for what the noise of the depths
+    /// themselves suggests.
+    pub tolerance: Option<f32>,
+    /// The tangent of the incidence beyond which neighbours are not taken for one surface.
+    pub steepest: f32,
+    /// How many times farther than the second nearest neighbour another one may lie.
+    pub gap_ratio: f32,
+    /// The same where there is one on the other side too, as between the rows of a scan at a grazing angle.
+    pub row_ratio: f32,
+    /// How far a sample covers towards a neighbour, as a part of the distance to it.
+    pub inner: f32,
+    /// How far a sample covers where the surface ends, as a part of its spacing.
+    pub outer: f32,
+    /// The widest gap that is closed, pixels.
+    pub max_gap: f32,
 }
 
 impl Default for Footprint {
     fn default() -> Self {
-        Self { tolerance: 0.003, roughness: 1.7, slope_cells: 1.25, flatness: 0.01, max_level: 4 }
+        Self { tolerance: None, steepest: 20.0, gap_ratio: 2.0, row_ratio: 4.0, inner: 0.8, outer: 0.85, max_gap: 32.0 }
     }
 }
 
@@ -51,25 +54,29 @@ impl Footprint {
             if !(0.0..1.0).contains(&tolerance) {
                 return Err(Error::invalid(format!("a relative tolerance of {tolerance} is not between 0 and 1")));
             }
-            this.tolerance = tolerance as f32;
+            this.tolerance = Some(tolerance as f32);
         }
         if let Some(gap) = max_gap {
-            if !(0.0..=1e4).contains(&gap) {
-                return Err(Error::invalid(format!("a widest gap of {gap} pixels is not between 0 and 10000")));
+            if !(0.0..=MAX_REACH as f64).contains(&gap) {
+                return Err(Error::invalid(format!("a widest gap of {gap} pixels is not between 0 and {MAX_REACH}")));
             }
-            // Opposite samples are up to four cells apart.
-            this.max_level = ((gap / 4.0).max(1.0).log2().round()) as usize;
+            this.max_gap = gap as f32;
         }
         Ok(this)
     }
 }
 
+/// The farthest that a footprint reaches, rows.
+const MAX_REACH: usize = 64;
+/// Rows that one task looks after; it may write into half as many above and below.
+const BAND: usize = 2 * MAX_REACH;
+
 /// The surfaces of a finished depth buffer.
 pub struct Surfaces {
     /// How the cells lie.
     pub grid: Grid,
-    /// Inverse depth of the nearest point in each cell, 0 where empty.
-    pub inverse_depth: Vec<f32>,
+    /// The nearest point in each cell.
+    pub samples: Vec<Sample>,
     /// A point in this cell is hidden when its inverse depth is below this; 0 where nothing hides.
     pub limit: Vec<f32>,
 }
@@ -78,56 +85,118 @@ impl Surfaces {
     /// From a depth buffer that everything was put into.
     pub fn new(buffer: DepthBuffer, footprint: &Footprint) -> Self {
         let (view, grid) = (*buffer.view(), buffer.grid());
-        Self::from_inverse_depth(&view, grid, buffer.into_inverse_depth(), footprint)
+        Self::from_samples(&view, grid, buffer.into_samples(), footprint)
     }
 
-    /// From the inverse depths in the cells of a grid.
+    /// From the inverse depths in the cells of a grid, of points at the pixels' centres.
     pub fn from_inverse_depth(view: &View, grid: Grid, inverse_depth: Vec<f32>, footprint: &Footprint) -> Self {
-        let mut level = Level {
-            width: grid.stride() - 2 * PAD,
-            height: grid.rows() - 2 * PAD,
-            samples: inverse_depth,
-            last_time: Vec::new(),
-        };
-        let pixel_angle = pixel_angle(view);
-        let levels = (grid.width.max(grid.height) / 64).max(1).ilog2().min(footprint.max_level as u32) as usize;
-        let mut finest: Option<Vec<f32>> = None;
-        let mut limits: Vec<(usize, Vec<f32>)> = Vec::new();
-        for k in 0..=levels {
-            if grid.wraps {
-                level.wrap();
-            }
-            let cell = (1_u32 << k) as f32;
-            let rule = Rule {
-                relative: footprint.tolerance + footprint.roughness * cell * pixel_angle,
-                slope_cells: footprint.slope_cells,
-                flatness: footprint.flatness,
-                own_cell: k == 0,
-            };
-            let (limit, next) = level.analyse(&rule);
-            let stride = level.stride();
-            let done = std::mem::replace(&mut level, next);
-            limits.push((stride, limit));
-            finest.get_or_insert(done.samples);
-        }
-        // Coarse limits hold in all the cells below them.
-        while limits.len() > 1 {
-            if let (Some((coarse_stride, coarse)), Some((stride, fine))) = (limits.pop(), limits.last_mut()) {
-                fine.par_chunks_mut(2 * *stride).enumerate().skip(PAD / 2).for_each(|(y, rows)| {
-                    let Some(parents) = coarse.chunks(coarse_stride).nth(y - PAD / 2 + PAD) else { return };
-                    for row in rows.chunks_mut(*stride) {
-                        for (pair, &parent) in row[PAD..].chunks_mut(2).zip(&parents[PAD..]) {
-                            for limit in pair {
-                                *limit = if *limit > parent { *limit } else { parent };
-                            }
-                        }
-                    }
-                });
-            }
-        }
-        let limit = limits.pop().map(|(_, limit)| limit).unwrap_or_default();
-        Self { grid, inverse_depth: finest.unwrap_or_default(), limit }
+        let centred = |&v: &f32| if v > 0.0 { Sample::new(v, 0.5, 0.5) } else { Sample::default() };
+        Self::from_samples(view, grid, inverse_depth.par_iter().map(centred).collect(), footprint)
     }
+
+    fn from_samples(view: &View, grid: Grid, mut samples: Vec<Sample>, footprint: &Footprint) -> Self {
+        grid.wrap(&mut samples);
+        let pixel_angle = pixel_angle(view);
+        let mut surroundings = Surroundings {
+            noise: 0.0,
+            grid,
+            samples: &samples,
+            tolerance: 0.001,
+            steepest: footprint.steepest * pixel_angle,
+            usual: 1.7 * pixel_angle,
+            gap_ratio: footprint.gap_ratio,
+            row_ratio: footprint.row_ratio,
+        };
+        surroundings.noise = surroundings.depth_noise();
+        let rule = Rule { footprint: *footprint, pixel_angle, noise: surroundings.noise };
+        if std::env::var("VIS_DEBUG").is_ok() {
+            eprintln!("noise {}", rule.noise);
+        }
+        let mut limit = vec![0.0_f32; grid.len()];
+        let mut spacing = vec![0_u8; grid.len()];
+        let mut open = in_bands(&grid, &mut limit, |_, rows, canvas| {
+            let mut open = Vec::new();
+            for y in rows {
+                for x in grid.used_columns() {
+                    let cell = y * grid.stride() + x;
+                    if samples[cell].found() {
+                        let (links, patch) = surroundings.nearby(cell);
+                        rule.cover(&grid, cell, &patch, canvas);
+                        open.push(links);
+                    }
+                }
+            }
+            open
+        });
+        let note = |spacing: &mut [u8], open: &[Vec<Links>]| {
+            for links in open.iter().flatten() {
+                spacing[links.cell as usize] = surroundings.spacing_code(links);
+            }
+        };
+        note(&mut spacing, &open);
+        let mut pyramid = Pyramid::new(&grid);
+        let mut reach = 3.0;
+        while reach < footprint.max_gap {
+            open.iter_mut().for_each(|band| band.retain(|links| surroundings.may_find_more(links, reach)));
+            if open.iter().all(Vec::is_empty) {
+                break;
+            }
+            pyramid.coarsen(&samples);
+            reach *= 2.0;
+            let pending: Vec<_> = open.into_iter().map(Mutex::new).collect();
+            open = in_bands(&grid, &mut limit, |band, _, canvas| {
+                let mut list = pending[band].lock().map(|mut list| std::mem::take(&mut *list)).unwrap_or_default();
+                for links in &mut list {
+                    if let Some(patch) = surroundings.farther(links, &pyramid, &spacing, footprint.max_gap) {
+                        rule.cover(&grid, links.cell as usize, &patch, canvas);
+                    }
+                }
+                list
+            });
+            note(&mut spacing, &open);
+        }
+        Self { grid, samples, limit }
+    }
+}
+
+fn band_count(grid: &Grid) -> usize {
+    (grid.rows() - 2 * grid.first_row()).div_ceil(BAND)
+}
+
+/// A part of the limits that one task may write into.
+struct Canvas<'a> {
+    first_row: usize,
+    cells: &'a mut [f32],
+}
+
+/// Runs `work(band, rows, canvas)` for bands of rows, all in parallel but no two neighbours at once, since each may write into
+/// its neighbours' rows.
+fn in_bands<T: Send>(
+    grid: &Grid,
+    limit: &mut [f32],
+    work: impl Fn(usize, std::ops::Range<usize>, &mut Canvas<'_>) -> T + Sync,
+) -> Vec<T> {
+    let (stride, rows, first) = (grid.stride(), grid.rows(), grid.first_row());
+    let count = band_count(grid);
+    let mut results: Vec<(usize, T)> = Vec::new();
+    for parity in 0..2 {
+        // Band k owns rows first + k·BAND …; its canvas begins half a band above.
+        let mut tasks = Vec::new();
+        let mut rest = &mut *limit;
+        let mut done = 0;
+        for k in (parity..count).step_by(2) {
+            let start = first + k * BAND;
+            let (from, to) = (start.saturating_sub(BAND / 2), (start + BAND + BAND / 2).min(rows));
+            let (_, tail) = std::mem::take(&mut rest).split_at_mut((from - done) * stride);
+            let (cells, tail) = tail.split_at_mut((to - from) * stride);
+            rest = tail;
+            done = to;
+            tasks.push((k, start..(start + BAND).min(rows - first), Canvas { first_row: from, cells }));
+        }
+        results.par_extend(tasks.into_par_iter().map(|(k, rows, mut canvas)| (k, work(k, rows, &mut canvas))));
+    }
+    results.sort_by_key(|(k, _)| *k);
+    results.into_iter().map(|(_, result)| result).collect()
 }
 
 /// Radians that a pixel spans in the middle of the photo.
@@ -141,136 +210,58 @@ pub(crate) fn pixel_angle(view: &View) -> f32 {
     }
 }
 
-/// The constants of one level.
 struct Rule {
-    relative: f32,
-    slope_cells: f32,
-    flatness: f32,
-    /// Whether a sample covers its cell without neighbours.
-    own_cell: bool,
+    footprint: Footprint,
+    pixel_angle: f32,
+    /// Sigma of a depth, in the cloud's unit.
+    noise: f32,
 }
 
-/// The samples in cells of one size, with a rim of [`PAD`] cells.
-struct Level {
-    width: usize,
-    height: usize,
-    /// Inverse depths, 0 where empty.
-    samples: Vec<f32>,
-    /// Samples whose surface was resolved one level below: they go no further up. Empty for "none".
-    last_time: Vec<bool>,
-}
-
-/// Offsets (x, y) of the first of two opposite cells, three in each of four directions.
-const DIRECTIONS: [[(isize, isize); 3]; 4] =
-    [[(1, 0), (2, 0), (2, 1)], [(1, 1), (2, 2), (1, 2)], [(0, 1), (0, 2), (-1, 2)], [(-1, 1), (-2, 2), (-2, 1)]];
-
-#[inline(always)]
-fn min(a: f32, b: f32) -> f32 {
-    if a < b { a } else { b }
-}
-
-#[inline(always)]
-fn max(a: f32, b: f32) -> f32 {
-    if a > b { a } else { b }
-}
-
-impl Level {
-    fn stride(&self) -> usize {
-        self.width + 2 * PAD
-    }
-
-    /// Fills the rim of a panorama: left and right are neighbours, and beyond a pole lies the other side.
-    fn wrap(&mut self) {
-        let (w, h, stride) = (self.width, self.height, self.stride());
-        for y in PAD..PAD + h {
-            let row = &mut self.samples[y * stride..(y + 1) * stride];
-            for k in 0..PAD {
-                row[k] = row[w + k];
-                row[PAD + w + k] = row[PAD + k];
-            }
-        }
-        for k in 0..PAD.min(h) {
-            for x in 0..stride {
-                let other = PAD + (x + 2 * w - PAD + w / 2) % w;
-                self.samples[(PAD - 1 - k) * stride + x] = self.samples[(PAD + k) * stride + other];
-                self.samples[(PAD + h + k) * stride + x] = self.samples[(PAD + h - 1 - k) * stride + other];
-            }
-        }
-    }
-
-    /// The limits of this level, in its own layout, and the samples of the next.
-    fn analyse(&self, rule: &Rule) -> (Vec<f32>, Level) {
-        let stride = self.stride();
-        let (next_width, next_height) = (self.width.div_ceil(2), self.height.div_ceil(2));
-        let next_stride = next_width + 2 * PAD;
-        let mut limit = vec![0.0_f32; self.samples.len()];
-        let mut samples = vec![0.0_f32; next_stride * (next_height + 2 * PAD)];
-        let mut last_time = vec![false; samples.len()];
-        let below = limit.par_chunks_mut(2 * stride).skip(PAD / 2);
-        let above = samples.par_chunks_mut(next_stride).zip(last_time.par_chunks_mut(next_stride)).skip(PAD);
-        below.zip(above).take(next_height).enumerate().for_each(|(pair, (limits, (up, up_last)))| {
-            let mut resolved = vec![false; stride];
-            for (k, limit) in limits.chunks_mut(stride).enumerate() {
-                let y = PAD + 2 * pair + k;
-                if y >= PAD + self.height {
-                    break;
-                }
-                self.analyse_row(y, rule, &mut limit[PAD..PAD + self.width], &mut resolved[PAD..]);
-                for x in PAD..PAD + self.width {
-                    let i = y * stride + x;
-                    let going = self.last_time.is_empty() || !self.last_time[i];
-                    let to = PAD + (x - PAD) / 2;
-                    if going && self.samples[i] > up[to] {
-                        up[to] = self.samples[i];
-                        up_last[to] = resolved[x];
-                    }
-                }
-            }
+impl Rule {
+    /// Draws what a sample covers.
+    fn cover(&self, grid: &Grid, cell: usize, patch: &Patch, canvas: &mut Canvas<'_>) {
+        let Footprint { inner, outer, tolerance, .. } = self.footprint;
+        let [gx, gy] = patch.gradient();
+        let own = patch.own + patch.lift([gx, gy]);
+        // Noise moves a point not only along the ray: across it, on a slope, it does as much.
+        let across = 0.5 + (1.5 * self.noise * own / self.pixel_angle).min(2.0);
+        let floor = tolerance.unwrap_or(1e-4 + 3.0 * self.noise * own) + 0.3 * self.pixel_angle;
+        let slack = own * floor + 0.25 * patch.misfit() + across * (gx.abs() + gy.abs());
+        let spacing = patch.spacing().unwrap_or(0.0);
+        let reach: [f32; QUADRANTS] = std::array::from_fn(|k| {
+            let (link, opposite) = (&patch.links[k], &patch.links[(k + 2) % QUADRANTS]);
+            let covered = match (link.found(), opposite.found()) {
+                (true, _) => inner * link.distance,
+                (false, true) => 0.9 * opposite.distance - 0.3,
+                (false, false) => 0.9 * spacing - 0.3,
+            };
+            covered.clamp(0.1, MAX_REACH as f32 - 1.0)
         });
-        (limit, Level { width: next_width, height: next_height, samples, last_time })
-    }
-
-    fn analyse_row(&self, y: usize, rule: &Rule, limit: &mut [f32], resolved: &mut [bool]) {
-        let stride = self.stride();
-        let rows: [&[f32]; 5] = std::array::from_fn(|k| &self.samples[(y + k - 2) * stride..][..stride]);
-        for x in 0..self.width {
-            let at = |dx: isize, dy: isize| rows[(2 + dy) as usize][(x as isize + 2 + dx) as usize];
-            resolved[x] = false;
-            let own = at(0, 0);
-            let mut covered = [0.0_f32; 4];
-            for (class, offsets) in covered.iter_mut().zip(&DIRECTIONS) {
-                for &(dx, dy) in offsets {
-                    *class = max(*class, min(at(dx, dy), at(-dx, -dy)));
+        let [east, south, west, north] = reach;
+        let stride = grid.stride();
+        let (column, row) = (cell % stride, cell / stride);
+        let [right, down] = patch.place;
+        let (x, y) = (column as f32 + right, row as f32 + down);
+        let top = ((y - north).ceil().max(0.0) as usize).max(canvas.first_row).min(row);
+        let bottom = ((y + south) as usize).min(canvas.first_row + canvas.cells.len() / stride - 1).max(row);
+        let first = ((x - west).ceil().max(0.0) as usize).min(column);
+        let last = ((x + east) as usize).min(stride - 1).max(column);
+        for j in top..=bottom {
+            let dy = j as f32 - y;
+            let ry = dy / if dy > 0.0 { south } else { north };
+            let cells = &mut canvas.cells[(j - canvas.first_row) * stride..][..stride];
+            for (i, limit) in cells.iter_mut().enumerate().take(last + 1).skip(first) {
+                let dx = i as f32 - x;
+                let rx = dx / if dx > 0.0 { east } else { west };
+                if rx * rx + ry * ry > 1.0 && (i, j) != (column, row) {
+                    continue;
+                }
+                let away = (dx * dx + dy * dy).sqrt();
+                let value = own + gx * dx + gy * dy - slack - own * self.pixel_angle * away;
+                if value > *limit {
+                    *limit = value;
                 }
             }
-            let [a, b, c, d] = covered;
-            // The second largest.
-            let cover = max(min(max(a, b), max(c, d)), max(min(a, b), min(c, d)));
-            let front = max(own, cover);
-            if front == 0.0 {
-                continue;
-            }
-            let (mut slope, mut directions) = (0.0_f32, 0);
-            for offsets in &DIRECTIONS {
-                let mut in_line = false;
-                for &(dx, dy) in offsets {
-                    let (a, b) = (at(dx, dy), at(-dx, -dy));
-                    let one_surface = min(a, b) > 0.0
-                        && (a + b - 2.0 * front).abs() <= 2.0 * rule.flatness * front
-                        && (a - b).abs() <= 0.3 * front;
-                    if one_surface {
-                        let reach = 2.0 * ((dx * dx + dy * dy) as f32).sqrt();
-                        slope = max(slope, (a - b).abs() / reach);
-                        in_line = true;
-                    }
-                }
-                directions += i32::from(in_line);
-            }
-            let own_in_front = own >= cover;
-            resolved[x] = own_in_front && directions >= 2;
-            let covers = rule.own_cell || (own_in_front && directions >= 1);
-            let surface = if covers { front } else { cover };
-            limit[x] = max(surface - front * rule.relative - rule.slope_cells * slope, 0.0);
         }
     }
 }

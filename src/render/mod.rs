@@ -5,11 +5,15 @@
 pub mod filling;
 mod footprint;
 pub mod intensity;
+mod links;
 pub mod resampling;
+mod sample;
 pub mod sci;
 mod zbuffer;
 
 pub(crate) use footprint::pixel_angle;
 pub use footprint::{Footprint, Surfaces};
+pub use sample::Sample;
+pub(crate) use sample::clamped;
 pub(crate) use zbuffer::fetch;
 pub use zbuffer::{DepthBuffer, Grid, IndexBuffer, Located};

@@ -2,13 +2,14 @@
 //!
 //! A cell keeps the largest *inverse* depth that was put into it (of a plane it is an affine function of the undistorted
 //! pixel position), merged by an atomic maximum: the order of the points, their chunks and the threads cannot be seen
-//! in the result, and adding may go on from several threads at once. An [`IndexBuffer`] keeps the point's index beside
-//! it, and of equal depths the lower index.
+//! in the result, and adding may go on from several threads at once. A [`DepthBuffer`] keeps where in the pixel the point
+//! lies beside it, an [`IndexBuffer`] the point's index, and of equal depths the lower index.
 
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
 
 use rayon::prelude::*;
 
+use super::sample::Sample;
 use crate::error::{Error, Result};
 use crate::geometry::{Block, BlockProjector, Frustum, LANES, Model, View};
 
@@ -19,7 +20,7 @@ const AHEAD: usize = 24;
 /// The widest band around the photo, pixels, that is kept too: what hides a point at the border may lie beyond it.
 const MAX_MARGIN: usize = 32;
 /// Cells beside the grid that are always there, so that neighbours can be asked for without looking.
-pub(super) const PAD: usize = 2;
+pub(super) const PAD: usize = 3;
 /// The largest inverse depth: what is nearer counts as this near, and sums stay finite.
 const NEAREST: f64 = 1e30;
 /// Where a point is not in the grid.
@@ -43,7 +44,7 @@ impl Grid {
     pub fn new(view: &View) -> Result<Self> {
         let (width, height) = (view.camera.width as usize, view.camera.height as usize);
         let wraps = view.camera.model() == Model::Equirectangular;
-        let margin = if wraps { 0 } else { MAX_MARGIN.min(width.max(height) / 16) };
+        let margin = MAX_MARGIN.min(width.max(height) / 16).min(width / 2).min(height);
         let grid = Self { width, height, margin, wraps };
         if grid.stride().saturating_mul(grid.rows()) >= NOWHERE as usize {
             return Err(Error::invalid(format!(
@@ -61,6 +62,38 @@ impl Grid {
     /// Rows, with margins and rim.
     pub fn rows(&self) -> usize {
         self.height + 2 * (self.margin + PAD)
+    }
+
+    /// The first row that may hold a sample; there are as many rows after the last.
+    pub(super) fn first_row(&self) -> usize {
+        PAD
+    }
+
+    /// The columns that may hold a sample.
+    pub(super) fn used_columns(&self) -> std::ops::Range<usize> {
+        PAD..self.stride() - PAD
+    }
+
+    /// Fills the margin of a panorama: left and right are neighbours, and beyond a pole lies the other side.
+    pub(super) fn wrap(&self, cells: &mut [Sample]) {
+        if !self.wraps {
+            return;
+        }
+        let (w, h, stride, start) = (self.width, self.height, self.stride(), self.margin + PAD);
+        for y in start..start + h {
+            let row = &mut cells[y * stride..(y + 1) * stride];
+            for k in 0..self.margin {
+                row[start - 1 - k] = row[start + w - 1 - k];
+                row[start + w + k] = row[start + k];
+            }
+        }
+        for k in 0..self.margin.min(h) {
+            for x in self.used_columns() {
+                let other = start + (x + 2 * w - start + w / 2) % w;
+                cells[(start - 1 - k) * stride + x] = cells[(start + k) * stride + other].upside_down();
+                cells[(start + h + k) * stride + x] = cells[(start + h - 1 - k) * stride + other].upside_down();
+            }
+        }
     }
 
     /// Cells, with margins and rim.
@@ -177,8 +210,9 @@ pub(crate) fn fetch<T>(cells: &[T], cell: u32) {
     let _ = (cells, cell);
 }
 
-/// Calls `put(cell, inverse depth, index)` for every point that the grid holds, in parallel.
-fn scatter<T: Sync>(view: &View, grid: &Grid, cells: &[T], xyz: &[[f64; 3]], put: impl Fn(&T, f32, usize) + Sync) {
+/// Calls `put(cells, block, located, index of the block's first point)` for every block of points that may meet the
+/// grid, in parallel.
+fn scatter(view: &View, grid: &Grid, xyz: &[[f64; 3]], put: impl Fn(&Block, &Located, std::ops::Range<usize>) + Sync) {
     let (projector, frustum) = (BlockProjector::new(view), Frustum::new(view, grid.margin as f64));
     xyz.par_chunks(TASK).enumerate().filter(|(_, points)| frustum.meets(points)).for_each(|(task, points)| {
         let (mut block, mut located) = (Block::new(), Located::new());
@@ -186,12 +220,7 @@ fn scatter<T: Sync>(view: &View, grid: &Grid, cells: &[T], xyz: &[[f64; 3]], put
             projector.project(points, &mut block);
             grid.locate(&block, grid.margin, &mut located);
             let first = task * TASK + k * LANES;
-            for i in 0..points.len() {
-                fetch(cells, located.ahead(i));
-                if let Some(cell) = cells.get(located.cell[i] as usize) {
-                    put(cell, located.inverse[i], first + i);
-                }
-            }
+            put(&block, &located, first..first + points.len());
         }
     });
 }
@@ -225,7 +254,7 @@ fn empty_cells<T: Zeroed>(n: usize) -> Result<Vec<T>> {
 pub struct DepthBuffer {
     view: View,
     grid: Grid,
-    /// Inverse depths as bits: of positive numbers these are in the numbers' order. 0 where empty.
+    /// [`Sample`]s.
     cells: Vec<AtomicU32>,
 }
 
@@ -239,10 +268,17 @@ impl DepthBuffer {
 
     /// Puts points in. May be called from several threads at once, in any order.
     pub fn add(&self, xyz: &[[f64; 3]]) {
-        scatter(&self.view, &self.grid, &self.cells, xyz, |cell, inverse, _| {
-            let bits = inverse.to_bits();
-            if cell.load(Ordering::Relaxed) < bits {
-                cell.fetch_max(bits, Ordering::Relaxed);
+        scatter(&self.view, &self.grid, xyz, |block, located, points| {
+            for i in 0..points.len() {
+                fetch(&self.cells, located.ahead(i));
+                if let Some((cell, inverse)) = located.get(i) {
+                    let (x, y) = (block.x[i] + 0.5, block.y[i] + 0.5);
+                    let sample = Sample::new(inverse, (x - x.floor()) as f32, (y - y.floor()) as f32);
+                    let cell = &self.cells[cell];
+                    if cell.load(Ordering::Relaxed) < sample.0 {
+                        cell.fetch_max(sample.0, Ordering::Relaxed);
+                    }
+                }
             }
         });
     }
@@ -257,9 +293,9 @@ impl DepthBuffer {
         self.grid
     }
 
-    /// The inverse depths, 0 where empty.
-    pub fn into_inverse_depth(self) -> Vec<f32> {
-        self.cells.into_iter().map(|cell| f32::from_bits(cell.into_inner())).collect()
+    /// The samples.
+    pub fn into_samples(self) -> Vec<Sample> {
+        self.cells.into_iter().map(|cell| Sample(cell.into_inner())).collect()
     }
 }
 
@@ -285,11 +321,17 @@ impl IndexBuffer {
         if first + xyz.len() as u64 > u64::from(u32::MAX) {
             return Err(Error::invalid(format!("an index buffer holds {} points at most", u32::MAX)));
         }
-        scatter(&self.view, &self.grid, &self.cells, xyz, |cell, inverse, i| {
-            let index = (first + i as u64) as u32;
-            let bits = u64::from(inverse.to_bits()) << 32 | u64::from(!index);
-            if inverse > 0.0 && cell.load(Ordering::Relaxed) < bits {
-                cell.fetch_max(bits, Ordering::Relaxed);
+        scatter(&self.view, &self.grid, xyz, |_, located, points| {
+            for i in 0..points.len() {
+                fetch(&self.cells, located.ahead(i));
+                if let Some((cell, inverse)) = located.get(i) {
+                    let index = (first + (points.start + i) as u64) as u32;
+                    let bits = u64::from(inverse.to_bits()) << 32 | u64::from(!index);
+                    let cell = &self.cells[cell];
+                    if inverse > 0.0 && cell.load(Ordering::Relaxed) < bits {
+                        cell.fetch_max(bits, Ordering::Relaxed);
+                    }
+                }
             }
         });
         Ok(())

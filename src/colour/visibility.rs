@@ -15,8 +15,7 @@ const REACH: usize = 4;
 const FLATNESS: f32 = 0.01;
 /// A step of this much, relative, is a depth edge.
 const EDGE: f32 = 0.05;
-/// The part of a pixel that surfaces have to cover to hide a point in it. Less than half, since a point that is coloured
-/// wrongly does more harm than one that is not coloured.
+/// The part of a pixel that surfaces have to cover to hide a point in it.
 const COVERED: f32 = 0.5;
 /// The part of the photo's width in which a weight rises from the border.
 const BORDER: f64 = 0.03;
@@ -133,11 +132,13 @@ impl VisibilityMap {
     pub(super) fn look(&self, points: &[[f64; 3]], sight: &mut Sight) {
         self.projector.project(points, &mut sight.block);
         self.surfaces.grid.locate(&sight.block, 0, &mut sight.located);
-        let limit = &self.surfaces.limit;
+        let (limit, stride) = (&self.surfaces.limit, self.surfaces.grid.stride() as u32);
         for i in 0..points.len() {
-            crate::render::fetch(limit, sight.located.ahead(i));
+            let (cell, other) = sight.located.ahead_with_row(i, stride);
+            crate::render::fetch(limit, cell);
+            crate::render::fetch(limit, other);
             if let Some((cell, inverse)) = sight.located.get(i)
-                && self.hidden(cell, clamped(inverse), sight.block.x[i], sight.block.y[i])
+                && self.hidden(cell, clamped(inverse), sight.located.place(i))
             {
                 sight.located.drop(i);
             }
@@ -150,14 +151,13 @@ impl VisibilityMap {
     /// Whether a point of this inverse depth lies behind a surface: by the four cells around it, as in bilinear
     /// interpolation, so that edges run between pixels and not along them.
     #[inline(always)]
-    fn hidden(&self, cell: usize, inverse: f32, x: f64, y: f64) -> bool {
+    fn hidden(&self, cell: usize, inverse: f32, [right, down]: [f32; 2]) -> bool {
         let limit = &self.surfaces.limit;
-        let (right, down) = ((x + 0.5).fract() as f32 - 0.5, (y + 0.5).fract() as f32 - 0.5);
-        let beside = if right < 0.0 { cell - 1 } else { cell + 1 };
         let stride = self.surfaces.grid.stride();
-        let above = if down < 0.0 { cell - stride } else { cell + stride };
+        let beside = if right < 0.5 { cell - 1 } else { cell + 1 };
+        let above = if down < 0.5 { cell - stride } else { cell + stride };
         let across = above + beside - cell;
-        let (a, b) = (right.abs(), down.abs());
+        let (a, b) = ((right - 0.5).abs(), (down - 0.5).abs());
         let weight = |cell: usize, weight: f32| if inverse < limit[cell] { weight } else { 0.0 };
         weight(cell, (1.0 - a) * (1.0 - b))
             + weight(beside, a * (1.0 - b))

@@ -9,18 +9,20 @@
 //!
 //! Everything here is a function of the merged buffer: chunks, their order and threads cannot be seen in it.
 
+use std::ops::Range;
 use std::sync::Mutex;
 
 use rayon::prelude::*;
 
-use super::links::{Links, Patch, Pyramid, QUADRANTS, Surroundings};
+use super::links::{Links, Patch, QUADRANTS, Surroundings};
+use super::pyramid::Pyramid;
 use super::sample::Sample;
 use super::zbuffer::{DepthBuffer, Grid};
 use crate::error::{Error, Result};
 use crate::geometry::View;
 
 /// How surfaces are told from gaps, and how much in front "in front" is. The defaults were set on simulated scans, where
-/// they lose about as many visible points as they pass hidden ones.
+/// they lose about one visible point in a hundred and pass one or two hidden ones.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Footprint {
     /// What is in front by less than this part of the depth hides nothing; `None` for what the noise of the depths
@@ -34,15 +36,13 @@ pub struct Footprint {
     pub row_ratio: f32,
     /// How far a sample covers towards a neighbour, as a part of the distance to it.
     pub inner: f32,
-    /// How far a sample covers where the surface ends, as a part of its spacing.
-    pub outer: f32,
     /// The widest gap that is closed, pixels.
     pub max_gap: f32,
 }
 
 impl Default for Footprint {
     fn default() -> Self {
-        Self { tolerance: None, steepest: 20.0, gap_ratio: 2.0, row_ratio: 4.0, inner: 0.8, outer: 0.85, max_gap: 32.0 }
+        Self { tolerance: None, steepest: 20.0, gap_ratio: 2.0, row_ratio: 4.0, inner: 0.9, max_gap: 32.0 }
     }
 }
 
@@ -68,6 +68,8 @@ impl Footprint {
 
 /// The farthest that a footprint reaches, rows.
 const MAX_REACH: usize = 64;
+/// How far the first look at the nearest cells goes, cells.
+const NEARBY: f32 = 3.0;
 /// Rows that one task looks after; it may write into half as many above and below.
 const BAND: usize = 2 * MAX_REACH;
 
@@ -90,52 +92,26 @@ impl Surfaces {
 
     /// From the inverse depths in the cells of a grid, of points at the pixels' centres.
     pub fn from_inverse_depth(view: &View, grid: Grid, inverse_depth: Vec<f32>, footprint: &Footprint) -> Self {
-        let centred = |&v: &f32| if v > 0.0 { Sample::new(v, 0.5, 0.5) } else { Sample::default() };
+        let centred = |&v: &f32| if v > 0.0 { Sample::new(v, [0.5, 0.5]) } else { Sample::default() };
         Self::from_samples(view, grid, inverse_depth.par_iter().map(centred).collect(), footprint)
     }
 
     fn from_samples(view: &View, grid: Grid, mut samples: Vec<Sample>, footprint: &Footprint) -> Self {
         grid.wrap(&mut samples);
         let pixel_angle = pixel_angle(view);
-        let mut surroundings = Surroundings {
-            noise: 0.0,
-            grid,
-            samples: &samples,
-            tolerance: 0.001,
-            steepest: footprint.steepest * pixel_angle,
-            usual: 1.7 * pixel_angle,
-            gap_ratio: footprint.gap_ratio,
-            row_ratio: footprint.row_ratio,
-        };
-        surroundings.noise = surroundings.depth_noise();
+        let ratios = [footprint.gap_ratio, footprint.row_ratio];
+        let surroundings = Surroundings::new(grid, &samples, footprint.steepest, pixel_angle, ratios);
         let rule = Rule { footprint: *footprint, pixel_angle, noise: surroundings.noise };
-        if std::env::var("VIS_DEBUG").is_ok() {
-            eprintln!("noise {}", rule.noise);
-        }
         let mut limit = vec![0.0_f32; grid.len()];
-        let mut spacing = vec![0_u8; grid.len()];
-        let mut open = in_bands(&grid, &mut limit, |_, rows, canvas| {
-            let mut open = Vec::new();
-            for y in rows {
-                for x in grid.used_columns() {
-                    let cell = y * grid.stride() + x;
-                    if samples[cell].found() {
-                        let (links, patch) = surroundings.nearby(cell);
-                        rule.cover(&grid, cell, &patch, canvas);
-                        open.push(links);
-                    }
-                }
-            }
-            open
-        });
-        let note = |spacing: &mut [u8], open: &[Vec<Links>]| {
-            for links in open.iter().flatten() {
-                spacing[links.cell as usize] = surroundings.spacing_code(links);
-            }
-        };
-        note(&mut spacing, &open);
+        let first = in_bands(&grid, &mut limit, |_, rows, canvas| FirstLook::over(&surroundings, &rule, rows, canvas));
+        let mut spacing = vec![0; grid.first_row() * grid.stride()];
+        let mut open = Vec::new();
+        for band in first {
+            spacing.extend(band.spacing);
+            open.push(band.open);
+        }
         let mut pyramid = Pyramid::new(&grid);
-        let mut reach = 3.0;
+        let mut reach = NEARBY;
         while reach < footprint.max_gap {
             open.iter_mut().for_each(|band| band.retain(|links| surroundings.may_find_more(links, reach)));
             if open.iter().all(Vec::is_empty) {
@@ -153,10 +129,82 @@ impl Surfaces {
                 }
                 list
             });
-            note(&mut spacing, &open);
+            for links in open.iter().flatten() {
+                spacing[links.cell as usize] = surroundings.spacing_code(links);
+            }
         }
+        let limit = closed(&grid, &limit);
         Self { grid, samples, limit }
     }
+}
+
+/// What a band's samples found in the nearest cells.
+struct FirstLook {
+    /// The samples' spacing in all cells of the band.
+    spacing: Vec<u8>,
+    /// The samples that may have neighbours farther away.
+    open: Vec<Links>,
+}
+
+impl FirstLook {
+    fn over(s: &Surroundings<'_>, rule: &Rule, rows: Range<usize>, canvas: &mut Canvas<'_>) -> Self {
+        #[cfg(target_arch = "x86_64")]
+        if std::arch::is_x86_feature_detected!("avx2") {
+            // SAFETY: the processor has the feature.
+            return unsafe { Self::over_avx2(s, rule, rows, canvas) };
+        }
+        Self::over_here(s, rule, rows, canvas)
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    unsafe fn over_avx2(s: &Surroundings<'_>, rule: &Rule, rows: Range<usize>, canvas: &mut Canvas<'_>) -> Self {
+        Self::over_here(s, rule, rows, canvas)
+    }
+
+    #[inline(always)]
+    fn over_here(s: &Surroundings<'_>, rule: &Rule, rows: Range<usize>, canvas: &mut Canvas<'_>) -> Self {
+        let stride = s.grid.stride();
+        let start = rows.start * stride;
+        let mut this = Self { spacing: vec![0; rows.len() * stride], open: Vec::new() };
+        for y in rows {
+            for x in s.grid.used_columns() {
+                let cell = y * stride + x;
+                if s.samples[cell].found() {
+                    let (links, patch) = s.nearby(cell);
+                    rule.cover(&s.grid, cell, &patch, canvas);
+                    this.spacing[cell - start] = patch.spacing_code();
+                    if s.farthest(&patch) > NEARBY + 1.0 {
+                        this.open.push(links);
+                    }
+                }
+            }
+        }
+        this
+    }
+}
+
+/// Closes holes up to three cells wide, which the chance of where points fall leaves in a surface: where limits lie opposite
+/// each other in at least two of four directions, the lower of two opposite ones holds in between. Beyond a straight
+/// edge there are none, so that surfaces do not grow; and of a plane the lower is never in front.
+fn closed(grid: &Grid, limit: &[f32]) -> Vec<f32> {
+    let stride = grid.stride();
+    let mut closed = vec![0.0_f32; limit.len()];
+    closed.par_chunks_mut(stride).enumerate().skip(2).take(grid.rows() - 4).for_each(|(y, row)| {
+        let rows: [&[f32]; 5] = std::array::from_fn(|k| &limit[(y + k - 2) * stride..][..stride]);
+        for (x, value) in row[..stride - 2].iter_mut().enumerate().skip(2) {
+            let larger = |a: f32, b: f32| if a > b { a } else { b };
+            let smaller = |a: f32, b: f32| if a < b { a } else { b };
+            let a = smaller(larger(rows[2][x + 1], rows[2][x + 2]), larger(rows[2][x - 1], rows[2][x - 2]));
+            let b = smaller(larger(rows[3][x], rows[4][x]), larger(rows[1][x], rows[0][x]));
+            let c = smaller(larger(rows[3][x + 1], rows[4][x + 2]), larger(rows[1][x - 1], rows[0][x - 2]));
+            let d = smaller(larger(rows[3][x - 1], rows[4][x - 2]), larger(rows[1][x + 1], rows[0][x + 2]));
+            // The second largest of the four.
+            let cover = larger(smaller(larger(a, b), larger(c, d)), larger(smaller(a, b), smaller(c, d)));
+            *value = larger(rows[2][x], cover);
+        }
+    });
+    closed
 }
 
 fn band_count(grid: &Grid) -> usize {
@@ -174,7 +222,7 @@ struct Canvas<'a> {
 fn in_bands<T: Send>(
     grid: &Grid,
     limit: &mut [f32],
-    work: impl Fn(usize, std::ops::Range<usize>, &mut Canvas<'_>) -> T + Sync,
+    work: impl Fn(usize, Range<usize>, &mut Canvas<'_>) -> T + Sync,
 ) -> Vec<T> {
     let (stride, rows, first) = (grid.stride(), grid.rows(), grid.first_row());
     let count = band_count(grid);
@@ -217,10 +265,17 @@ struct Rule {
     noise: f32,
 }
 
+/// How far beyond its last sample a surface reaches, as a part of the distance to the neighbour before it, and less by
+/// some of a pixel, so that bars of the width of a pixel do not grow.
+const OUTER: (f32, f32) = (0.9, 0.15);
+/// The least that a sample covers, cells.
+const LEAST: f32 = 0.1;
+
 impl Rule {
     /// Draws what a sample covers.
+    #[inline(always)]
     fn cover(&self, grid: &Grid, cell: usize, patch: &Patch, canvas: &mut Canvas<'_>) {
-        let Footprint { inner, outer, tolerance, .. } = self.footprint;
+        let Footprint { inner, tolerance, .. } = self.footprint;
         let [gx, gy] = patch.gradient();
         let own = patch.own + patch.lift([gx, gy]);
         // Noise moves a point not only along the ray: across it, on a slope, it does as much.
@@ -228,38 +283,43 @@ impl Rule {
         let floor = tolerance.unwrap_or(1e-4 + 3.0 * self.noise * own) + 0.3 * self.pixel_angle;
         let slack = own * floor + 0.25 * patch.misfit() + across * (gx.abs() + gy.abs());
         let spacing = patch.spacing().unwrap_or(0.0);
-        let reach: [f32; QUADRANTS] = std::array::from_fn(|k| {
+        let [east, south, west, north]: [f32; QUADRANTS] = std::array::from_fn(|k| {
             let (link, opposite) = (&patch.links[k], &patch.links[(k + 2) % QUADRANTS]);
             let covered = match (link.found(), opposite.found()) {
                 (true, _) => inner * link.distance,
-                (false, true) => 0.9 * opposite.distance - 0.3,
-                (false, false) => 0.9 * spacing - 0.3,
+                (false, true) => OUTER.0 * opposite.distance - OUTER.1,
+                (false, false) => OUTER.0 * spacing - OUTER.1,
             };
-            covered.clamp(0.1, MAX_REACH as f32 - 1.0)
+            covered.max(LEAST).min(MAX_REACH as f32 - 1.0)
         });
-        let [east, south, west, north] = reach;
         let stride = grid.stride();
-        let (column, row) = (cell % stride, cell / stride);
+        let (column, row) = ((cell as u32 % stride as u32) as usize, (cell as u32 / stride as u32) as usize);
         let [right, down] = patch.place;
-        let (x, y) = (column as f32 + right, row as f32 + down);
-        let top = ((y - north).ceil().max(0.0) as usize).max(canvas.first_row).min(row);
-        let bottom = ((y + south) as usize).min(canvas.first_row + canvas.cells.len() / stride - 1).max(row);
-        let first = ((x - west).ceil().max(0.0) as usize).min(column);
-        let last = ((x + east) as usize).min(stride - 1).max(column);
-        for j in top..=bottom {
-            let dy = j as f32 - y;
-            let ry = dy / if dy > 0.0 { south } else { north };
-            let cells = &mut canvas.cells[(j - canvas.first_row) * stride..][..stride];
-            for (i, limit) in cells.iter_mut().enumerate().take(last + 1).skip(first) {
-                let dx = i as f32 - x;
-                let rx = dx / if dx > 0.0 { east } else { west };
-                if rx * rx + ry * ry > 1.0 && (i, j) != (column, row) {
-                    continue;
-                }
-                let away = (dx * dx + dy * dy).sqrt();
-                let value = own + gx * dx + gy * dy - slack - own * self.pixel_angle * away;
-                if value > *limit {
-                    *limit = value;
+        let value = |dx: f32, dy: f32| {
+            let away = (dx * dx + dy * dy).sqrt();
+            own + gx * dx + gy * dy - slack - own * self.pixel_angle * away
+        };
+        // Cells are numbered from the sample's own; it is covered even where the sample lies in a corner of it.
+        let up = ((north - down) as usize).min(row - canvas.first_row) as isize;
+        let below =
+            ((south + down).max(0.0) as usize).min(canvas.first_row + canvas.cells.len() / stride - 1 - row) as isize;
+        let before = ((west - right) as usize).min(column) as isize;
+        let after = ((east + right).max(0.0) as usize).min(stride - 1 - column) as isize;
+        let (per_east, per_west) = (1.0 / east, 1.0 / west);
+        let (per_south, per_north) = (1.0 / south, 1.0 / north);
+        for j in -up..=below {
+            let dy = j as f32 - down;
+            let ry = dy * if dy > 0.0 { per_south } else { per_north };
+            let start = (row as isize + j - canvas.first_row as isize) * stride as isize + column as isize;
+            for i in -before..=after {
+                let dx = i as f32 - right;
+                let rx = dx * if dx > 0.0 { per_east } else { per_west };
+                if rx * rx + ry * ry <= 1.0 || (i, j) == (0, 0) {
+                    let limit = &mut canvas.cells[(start + i) as usize];
+                    let value = value(dx, dy);
+                    if value > *limit {
+                        *limit = value;
+                    }
                 }
             }
         }

@@ -4,22 +4,29 @@
 
 use rayon::prelude::*;
 
+use super::pyramid::Pyramid;
 use super::sample::Sample;
 use super::zbuffer::Grid;
 
 /// East, south, west, north.
 pub(super) const QUADRANTS: usize = 4;
-/// Cells that are looked at on each side, at every level.
-const WINDOW: isize = 3;
+/// By how much two depths of one surface may differ beside what their distance makes, relative.
+const TOLERANCE: f32 = 0.001;
+/// The tangent of an incidence that is nothing special.
+const USUAL: f32 = 1.7;
+/// Rows of which one is looked at for the noise.
+const EVERY: usize = 16;
 /// Offsets in each quadrant.
 const RING: usize = 12;
 
-/// A sample and the cells of its neighbours, 0 for none.
+/// A sample and where its neighbours are, cells to the right and down; (0, 0) for none.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Links {
     pub cell: u32,
-    near: [u32; QUADRANTS],
+    near: [(i8, i8); QUADRANTS],
 }
+
+const NONE: (i8, i8) = (0, 0);
 
 /// A neighbour as the sample sees it. `distance` is 0 for none.
 #[derive(Debug, Clone, Copy, Default)]
@@ -32,10 +39,12 @@ pub(super) struct Link {
 }
 
 impl Link {
+    #[inline(always)]
     pub fn found(&self) -> bool {
         self.distance > 0.0
     }
 
+    #[inline(always)]
     fn slope(&self) -> f32 {
         self.rise / self.distance
     }
@@ -53,6 +62,7 @@ pub(super) struct Patch {
 
 impl Patch {
     /// The distance of the second nearest neighbour: two are needed to call it a surface.
+    #[inline(always)]
     pub fn spacing(&self) -> Option<f32> {
         let (mut first, mut second) = (f32::INFINITY, f32::INFINITY);
         for link in self.links.iter().filter(|link| link.found()) {
@@ -66,7 +76,14 @@ impl Patch {
         (second < f32::INFINITY).then_some(second)
     }
 
+    /// The spacing in quarters of a pixel; 0 for unknown.
+    #[inline(always)]
+    pub fn spacing_code(&self) -> u8 {
+        self.spacing().map_or(0, |s| (4.0 * s + 1.0) as u8)
+    }
+
     /// The plane through the sample that fits the neighbours best: the change of the inverse depth by one cell.
+    #[inline(always)]
     pub fn gradient(&self) -> [f32; 2] {
         let (mut xx, mut xy, mut yy, mut xr, mut yr) = (0.0_f32, 0.0, 0.0, 0.0, 0.0);
         for link in self.links.iter().filter(|link| link.found()) {
@@ -84,6 +101,7 @@ impl Patch {
     }
 
     /// How much nearer than the sample itself the plane with this gradient passes that fits sample and neighbours.
+    #[inline(always)]
     pub fn lift(&self, [gx, gy]: [f32; 2]) -> f32 {
         let (mut sum, mut n) = (0.0, 1.0);
         for link in self.links.iter().filter(|link| link.found()) {
@@ -94,12 +112,14 @@ impl Patch {
     }
 
     /// How far the sample lies off the line between two opposite neighbours; the sum for both pairs.
+    #[inline(always)]
     pub fn misfit(&self) -> f32 {
         (0..2).filter_map(|k| self.off_line(k)).map(|(off, _)| off.abs()).sum()
     }
 
     /// The sample's inverse depth against the line between the neighbours of quadrants `k` and `k + 2`; and by how much
     /// its sigma exceeds that of one depth.
+    #[inline(always)]
     fn off_line(&self, k: usize) -> Option<(f32, f32)> {
         let (a, b) = (self.links[k], self.links[k + 2]);
         (a.found() && b.found()).then(|| {
@@ -111,6 +131,7 @@ impl Patch {
 
     /// Drops what does not belong: of two opposite neighbours that are not on one line with the sample the steeper when
     /// it is steep, and what is too far for the spacing.
+    #[inline(always)]
     fn prune(&mut self, s: &Surroundings<'_>) {
         for k in 0..2 {
             let (a, b) = (self.links[k], self.links[k + 2]);
@@ -144,16 +165,32 @@ pub(super) struct Surroundings<'a> {
     pub samples: &'a [Sample],
     /// Sigma of a depth, in the cloud's unit.
     pub noise: f32,
-    /// Relative noise of a depth.
-    pub tolerance: f32,
+    /// By how much two depths of one surface may differ in one place, relative.
+    tolerance: f32,
     /// The largest relative change by one cell.
-    pub steepest: f32,
+    steepest: f32,
     /// The largest relative change by one cell that is nothing special.
-    pub usual: f32,
+    usual: f32,
     /// How many times the spacing a gap may be wide.
-    pub gap_ratio: f32,
+    gap_ratio: f32,
     /// The same where gaps follow each other as the rows of a scan do.
-    pub row_ratio: f32,
+    row_ratio: f32,
+    rings: [[Probe; RING]; QUADRANTS],
+}
+
+/// Where to look for a neighbour.
+#[derive(Debug, Clone, Copy)]
+struct Probe {
+    /// Cells in the buffer.
+    step: isize,
+    offset: (i8, i8),
+    /// By how much its inverse depth may differ, relative.
+    allowed: f32,
+}
+
+#[inline(always)]
+fn larger(a: f32, b: f32) -> f32 {
+    if a > b { a } else { b }
 }
 
 /// The quadrant of an offset.
@@ -182,56 +219,81 @@ fn turned((dx, dy): (isize, isize), quadrant: usize) -> (isize, isize) {
     }
 }
 
-impl Surroundings<'_> {
-    #[inline(always)]
-    fn one_surface(&self, own: f32, other: f32, distance: f32) -> bool {
-        (other - own).abs() <= own.max(other) * (self.tolerance + self.steepest * distance)
+impl<'a> Surroundings<'a> {
+    /// For samples whose depths are good to `tolerance`, with surfaces as steep as the tangent `steepest` of the incidence,
+    /// seen with pixels of this angle.
+    pub fn new(grid: Grid, samples: &'a [Sample], steepest: f32, pixel_angle: f32, ratios: [f32; 2]) -> Self {
+        let (tolerance, steepest, stride) = (TOLERANCE, steepest * pixel_angle, grid.stride() as isize);
+        let rings = std::array::from_fn(|k| {
+            FIRST.map(|offset| {
+                let (dx, dy) = turned(offset, k);
+                let distance = ((dx * dx + dy * dy) as f32).sqrt();
+                let allowed = tolerance + steepest * distance;
+                Probe { step: dy * stride + dx, offset: (dx as i8, dy as i8), allowed }
+            })
+        });
+        let [gap_ratio, row_ratio] = ratios;
+        let usual = USUAL * pixel_angle;
+        let mut this = Self { grid, samples, noise: 0.0, tolerance, steepest, usual, gap_ratio, row_ratio, rings };
+        this.noise = this.depth_noise();
+        this
     }
 
-    fn link(&self, cell: usize, other: usize) -> Link {
-        let stride = self.grid.stride();
-        let (a, b) = (self.samples[cell], self.samples[other]);
-        let ([ax, ay], [bx, by]) = (a.place(), b.place());
-        let dx = (other % stride) as f32 - (cell % stride) as f32 + bx - ax;
-        let dy = (other / stride) as f32 - (cell / stride) as f32 + by - ay;
+    #[inline(always)]
+    fn one_surface(&self, own: f32, other: f32, distance: f32) -> bool {
+        (other - own).abs() <= larger(own, other) * (self.tolerance + self.steepest * distance)
+    }
+
+    #[inline(always)]
+    fn link(&self, own: f32, place: [f32; 2], other: Sample, (dx, dy): (i8, i8)) -> Link {
+        let [right, down] = other.place();
+        let (dx, dy) = (f32::from(dx) + right - place[0], f32::from(dy) + down - place[1]);
         // Two samples in neighbouring cells may lie closer together than the positions tell.
-        let distance = dx.hypot(dy).max(0.25);
-        Link { dx, dy, rise: b.inverse_depth() - a.inverse_depth(), distance }
+        let distance = larger((dx * dx + dy * dy).sqrt(), 0.25);
+        Link { dx, dy, rise: other.inverse_depth() - own, distance }
     }
 
     /// The surface at a sample.
+    #[inline(always)]
     pub fn patch(&self, links: &Links) -> Patch {
-        let cell = links.cell as usize;
-        let link = |&near: &u32| if near == 0 { Link::default() } else { self.link(cell, near as usize) };
-        let sample = self.samples[cell];
-        let links: [Link; QUADRANTS] = std::array::from_fn(|k| link(&links.near[k]));
-        Patch { own: sample.inverse_depth(), place: sample.place(), links }
+        let sample = self.samples[links.cell as usize];
+        let (own, place, stride) = (sample.inverse_depth(), sample.place(), self.grid.stride() as isize);
+        let link = |near: (i8, i8)| {
+            if near == NONE {
+                return Link::default();
+            }
+            let at = links.cell as isize + isize::from(near.1) * stride + isize::from(near.0);
+            self.link(own, place, self.samples[at as usize], near)
+        };
+        Patch { own, place, links: links.near.map(link) }
     }
 
+    #[inline(always)]
     fn pruned(&self, links: &mut Links) -> Patch {
         let mut patch = self.patch(links);
         patch.prune(self);
         for (near, link) in links.near.iter_mut().zip(&patch.links) {
             if !link.found() {
-                *near = 0;
+                *near = NONE;
             }
         }
         patch
     }
 
     /// Looks at the nearest cells.
+    #[inline(always)]
     pub fn nearby(&self, cell: usize) -> (Links, Patch) {
         let own = self.samples[cell].inverse_depth();
-        let stride = self.grid.stride() as isize;
-        let mut links = Links { cell: cell as u32, near: [0; QUADRANTS] };
-        for (k, near) in links.near.iter_mut().enumerate() {
-            for &offset in &FIRST {
-                let (dx, dy) = turned(offset, k);
-                let at = (cell as isize + dy * stride + dx) as usize;
-                let other = self.samples[at];
-                if other.found() && self.one_surface(own, other.inverse_depth(), ((dx * dx + dy * dy) as f32).sqrt()) {
-                    *near = at as u32;
-                    break;
+        let mut links = Links { cell: cell as u32, near: [NONE; QUADRANTS] };
+        for (near, ring) in links.near.iter_mut().zip(&self.rings) {
+            for probe in ring {
+                let other = self.samples[(cell as isize + probe.step) as usize];
+                if other.found() {
+                    let v = other.inverse_depth();
+                    if (v - own).abs() <= larger(own, v) * probe.allowed {
+                        *near = probe.offset;
+                        break;
+                    }
                 }
             }
         }
@@ -241,18 +303,33 @@ impl Surroundings<'_> {
 
     /// Whether looking farther than `reach` makes sense.
     pub fn may_find_more(&self, links: &Links, reach: f32) -> bool {
-        links.near.contains(&0) && self.patch(links).spacing().is_none_or(|s| s * self.row_ratio > reach)
+        links.near.contains(&NONE) && self.farthest(&self.patch(links)) > reach + 1.0
     }
 
-    /// The spacing at a sample in quarters of a pixel; 0 for unknown.
+    /// How far away a neighbour may lie that a patch still misses: what is farther would be pruned.
+    #[inline(always)]
+    pub fn farthest(&self, patch: &Patch) -> f32 {
+        let Some(spacing) = patch.spacing() else { return f32::INFINITY };
+        let mut farthest = 0.0;
+        for (k, link) in patch.links.iter().enumerate() {
+            if !link.found() {
+                let rows = (2.0 * patch.links[(k + 2) % QUADRANTS].distance).min(self.row_ratio * spacing);
+                farthest = larger(farthest, larger(rows, self.gap_ratio * spacing));
+            }
+        }
+        farthest
+    }
+
+    /// The surface's spacing at a sample after looking farther.
     pub fn spacing_code(&self, links: &Links) -> u8 {
-        self.patch(links).spacing().map_or(0, |s| (4.0 * s).ceil().min(255.0) as u8)
+        self.patch(links).spacing_code()
     }
 
     /// The sigma of a depth in the cloud's unit, from samples against the lines between their neighbours: the median of
     /// a sixteenth of the rows, so that edges and leaves do not count. 0 where the samples stand too far apart.
     pub fn depth_noise(&self) -> f32 {
-        let rows: Vec<usize> = (self.grid.first_row()..self.grid.rows() - self.grid.first_row()).step_by(16).collect();
+        let rows: Vec<usize> =
+            (self.grid.first_row()..self.grid.rows() - self.grid.first_row()).step_by(EVERY).collect();
         let mut off: Vec<f32> = rows
             .into_par_iter()
             .flat_map_iter(|y| self.grid.used_columns().map(move |x| y * self.grid.stride() + x))
@@ -276,13 +353,13 @@ impl Surroundings<'_> {
         let patch = self.patch(links);
         let stride = self.grid.stride() as isize;
         let (x, y) = (links.cell as isize % stride, links.cell as isize / stride);
-        let reach = patch.spacing().map_or(max_gap, |s| (s * self.row_ratio).min(max_gap));
+        let reach = self.farthest(&patch).min(max_gap);
         let mut best = [f32::INFINITY; QUADRANTS];
         let before = *links;
-        pyramid.around(x, y, |other| {
+        pyramid.around(x, y, reach, |other| {
             let (dx, dy) = (other as isize % stride - x, other as isize / stride - y);
             let k = quadrant(dx, dy);
-            if (dx, dy) == (0, 0) || before.near[k] != 0 {
+            if (dx, dy) == (0, 0) || before.near[k] != NONE {
                 return;
             }
             let d = ((dx * dx + dy * dy) as f32).sqrt();
@@ -290,62 +367,11 @@ impl Surroundings<'_> {
             let near = d <= reach && (its == 0 || d <= 0.25 * f32::from(its) * self.row_ratio);
             if d < best[k] && near && self.one_surface(patch.own, self.samples[other as usize].inverse_depth(), d) {
                 best[k] = d;
-                links.near[k] = other;
+                links.near[k] = (dx as i8, dy as i8);
             }
         });
         let patch = self.pruned(links);
         (0..QUADRANTS).any(|k| links.near[k] != before.near[k]).then_some(patch)
-    }
-}
-
-/// Cells of growing width, each with the foremost sample below it.
-pub(super) struct Pyramid {
-    level: u32,
-    stride: usize,
-    rows: usize,
-    /// The cell of the buffer, 0 for none.
-    front: Vec<u32>,
-}
-
-impl Pyramid {
-    /// The buffer itself.
-    pub fn new(grid: &Grid) -> Self {
-        Self { level: 0, stride: grid.stride(), rows: grid.rows(), front: Vec::new() }
-    }
-
-    /// One level up.
-    pub fn coarsen(&mut self, samples: &[Sample]) {
-        let (stride, rows) = (self.stride.div_ceil(2), self.rows.div_ceil(2));
-        let mut front = vec![0_u32; stride * rows];
-        let (old, old_stride, old_rows, base) = (&self.front, self.stride, self.rows, self.level == 0);
-        front.par_chunks_mut(stride).enumerate().for_each(|(y, row)| {
-            for (x, best) in row.iter_mut().enumerate() {
-                for cy in 2 * y..(2 * y + 2).min(old_rows) {
-                    for cx in 2 * x..(2 * x + 2).min(old_stride) {
-                        let cell = cy * old_stride + cx;
-                        let candidate = if base { cell as u32 } else { old[cell] };
-                        if samples[candidate as usize] > samples[*best as usize] {
-                            *best = candidate;
-                        }
-                    }
-                }
-            }
-        });
-        *self = Self { level: self.level + 1, stride, rows, front };
-    }
-
-    /// The foremost samples in the cells around a position.
-    fn around(&self, x: isize, y: isize, mut see: impl FnMut(u32)) {
-        let (cx, cy) = (x >> self.level, y >> self.level);
-        let (left, right) = ((cx - WINDOW).max(0), (cx + WINDOW).min(self.stride as isize - 1));
-        for row in (cy - WINDOW).max(0)..=(cy + WINDOW).min(self.rows as isize - 1) {
-            let start = row as usize * self.stride;
-            for &cell in &self.front[start + left as usize..=start + right as usize] {
-                if cell != 0 {
-                    see(cell);
-                }
-            }
-        }
     }
 }
 

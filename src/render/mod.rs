@@ -6,6 +6,7 @@ pub mod filling;
 mod footprint;
 pub mod intensity;
 mod links;
+mod pyramid;
 pub mod resampling;
 mod sample;
 pub mod sci;

@@ -23,11 +23,12 @@ const DROPPED: u32 = 32 - 2 * PLACE - 16;
 pub struct Sample(pub u32);
 
 impl Sample {
-    /// The nearer of two is the larger; of equal depths the one that lies farther right, then farther down.
+    /// From an inverse depth and a place in the pixel, right and down, in [0, 1]. The nearer of two is the larger; of
+    /// equal depths the one that lies farther right, then farther down.
     #[inline(always)]
-    pub fn new(inverse_depth: f32, right: f32, down: f32) -> Self {
+    pub fn new(inverse_depth: f32, [right, down]: [f32; 2]) -> Self {
         let depth = (clamped(inverse_depth).to_bits() - BASE) >> DROPPED;
-        let place = |part: f32| (part * STEPS) as u32 & ((1 << PLACE) - 1);
+        let place = |part: f32| ((part * STEPS) as u32).min((1 << PLACE) - 1);
         Self(depth << (2 * PLACE) | place(right) << PLACE | place(down))
     }
 
@@ -59,7 +60,7 @@ impl Sample {
 /// An inverse depth within what a sample can keep: what is compared with samples has to pass here as they did.
 #[inline(always)]
 pub fn clamped(inverse_depth: f32) -> f32 {
-    inverse_depth.max(FARTHEST).min(NEAREST)
+    inverse_depth.clamp(FARTHEST, NEAREST)
 }
 
 #[cfg(test)]
@@ -71,7 +72,7 @@ mod tests {
         for i in 0..20_000 {
             let inverse = 2.0_f32.powf(-20.0 + 32.0 * (i as f32 + 0.5) / 20_000.0);
             let (right, down) = ((i % 97) as f32 / 97.0, (i % 89) as f32 / 89.0);
-            let sample = Sample::new(inverse, right, down);
+            let sample = Sample::new(inverse, [right, down]);
             assert!((sample.inverse_depth() / inverse - 1.0).abs() < 4.1e-6, "{inverse}");
             let [a, b] = sample.place();
             assert!((a + 0.5 - right).abs() <= 0.5 / STEPS + 1e-6 && (b + 0.5 - down).abs() <= 0.5 / STEPS + 1e-6);
@@ -81,9 +82,9 @@ mod tests {
 
     #[test]
     fn the_nearer_is_the_larger_and_extremes_are_kept_within_range() {
-        assert!(Sample::new(0.2, 0.0, 0.0) > Sample::new(0.1999, 0.9, 0.9));
+        assert!(Sample::new(0.2, [0.0, 0.0]) > Sample::new(0.1999, [0.9, 0.9]));
         for inverse in [0.0, 1e-30, f32::MIN_POSITIVE, 1e30, f32::INFINITY] {
-            let sample = Sample::new(inverse, 0.99, 0.99);
+            let sample = Sample::new(inverse, [0.99, 0.99]);
             assert!(sample.found() && (FARTHEST * 0.999..4096.0).contains(&sample.inverse_depth()), "{inverse}");
         }
         assert!(!Sample::default().found());

@@ -137,6 +137,8 @@ impl Grid {
             let (column, row) =
                 unsafe { (column.to_int_unchecked::<i32>() as u32, row.to_int_unchecked::<i32>() as u32) };
             cells.cell[i] = if inside { row * stride + column } else { NOWHERE };
+            cells.right[i] = (x + offset - f64::from(column as i32)) as f32;
+            cells.down[i] = (y + offset - f64::from(row as i32)) as f32;
             cells.inverse[i] = if inside { (1.0 / depth).min(NEAREST) as f32 } else { 0.0 };
         }
     }
@@ -164,12 +166,15 @@ impl Grid {
 pub struct Located {
     cell: [u32; LANES],
     inverse: [f32; LANES],
+    /// Where in its cell the point lies, in [0, 1].
+    right: [f32; LANES],
+    down: [f32; LANES],
 }
 
 impl Located {
     /// Room for a block.
     pub fn new() -> Self {
-        Self { cell: [NOWHERE; LANES], inverse: [0.0; LANES] }
+        Self { cell: [NOWHERE; LANES], inverse: [0.0; LANES], right: [0.0; LANES], down: [0.0; LANES] }
     }
 
     /// The cell and inverse depth of a point; `None` beside the grid.
@@ -178,10 +183,24 @@ impl Located {
         (self.cell[i] != NOWHERE).then_some((self.cell[i] as usize, self.inverse[i]))
     }
 
+    /// Where in its cell a point lies, right and down, in [0, 1].
+    #[inline(always)]
+    pub fn place(&self, i: usize) -> [f32; 2] {
+        [self.right[i], self.down[i]]
+    }
+
     /// The cell of a point that follows some way behind this one, to be fetched.
     #[inline(always)]
     pub(crate) fn ahead(&self, i: usize) -> u32 {
         self.cell[(i + AHEAD) % LANES]
+    }
+
+    /// The same, and the cell above or below it that is nearer to the point.
+    #[inline(always)]
+    pub(crate) fn ahead_with_row(&self, i: usize, stride: u32) -> (u32, u32) {
+        let i = (i + AHEAD) % LANES;
+        let cell = self.cell[i];
+        (cell, if self.down[i] < 0.5 { cell.wrapping_sub(stride) } else { cell.wrapping_add(stride) })
     }
 
     /// Takes a point out.
@@ -210,9 +229,8 @@ pub(crate) fn fetch<T>(cells: &[T], cell: u32) {
     let _ = (cells, cell);
 }
 
-/// Calls `put(cells, block, located, index of the block's first point)` for every block of points that may meet the
-/// grid, in parallel.
-fn scatter(view: &View, grid: &Grid, xyz: &[[f64; 3]], put: impl Fn(&Block, &Located, std::ops::Range<usize>) + Sync) {
+/// Calls `put(located, indices)` for every block of points that may meet the grid, in parallel.
+fn scatter(view: &View, grid: &Grid, xyz: &[[f64; 3]], put: impl Fn(&Located, std::ops::Range<usize>) + Sync) {
     let (projector, frustum) = (BlockProjector::new(view), Frustum::new(view, grid.margin as f64));
     xyz.par_chunks(TASK).enumerate().filter(|(_, points)| frustum.meets(points)).for_each(|(task, points)| {
         let (mut block, mut located) = (Block::new(), Located::new());
@@ -220,7 +238,7 @@ fn scatter(view: &View, grid: &Grid, xyz: &[[f64; 3]], put: impl Fn(&Block, &Loc
             projector.project(points, &mut block);
             grid.locate(&block, grid.margin, &mut located);
             let first = task * TASK + k * LANES;
-            put(&block, &located, first..first + points.len());
+            put(&located, first..first + points.len());
         }
     });
 }
@@ -268,12 +286,11 @@ impl DepthBuffer {
 
     /// Puts points in. May be called from several threads at once, in any order.
     pub fn add(&self, xyz: &[[f64; 3]]) {
-        scatter(&self.view, &self.grid, xyz, |block, located, points| {
+        scatter(&self.view, &self.grid, xyz, |located, points| {
             for i in 0..points.len() {
                 fetch(&self.cells, located.ahead(i));
                 if let Some((cell, inverse)) = located.get(i) {
-                    let (x, y) = (block.x[i] + 0.5, block.y[i] + 0.5);
-                    let sample = Sample::new(inverse, (x - x.floor()) as f32, (y - y.floor()) as f32);
+                    let sample = Sample::new(inverse, located.place(i));
                     let cell = &self.cells[cell];
                     if cell.load(Ordering::Relaxed) < sample.0 {
                         cell.fetch_max(sample.0, Ordering::Relaxed);
@@ -321,7 +338,7 @@ impl IndexBuffer {
         if first + xyz.len() as u64 > u64::from(u32::MAX) {
             return Err(Error::invalid(format!("an index buffer holds {} points at most", u32::MAX)));
         }
-        scatter(&self.view, &self.grid, xyz, |_, located, points| {
+        scatter(&self.view, &self.grid, xyz, |located, points| {
             for i in 0..points.len() {
                 fetch(&self.cells, located.ahead(i));
                 if let Some((cell, inverse)) = located.get(i) {

@@ -55,7 +55,8 @@ def test_an_index_buffer_is_that_of_numpy(rng):
     found = expected >= 0
     assert np.allclose(depth.ravel()[found], z[expected[found]], rtol=1e-6)
     assert np.isnan(depth.ravel()[~found]).all()
-    assert np.array_equal(see(view, xyz).depth(), depth, equal_nan=True)
+    # A depth buffer keeps 22 bits of the depth.
+    assert np.allclose(see(view, xyz).depth(), depth, rtol=5e-6, atol=0, equal_nan=True)
 
 
 def test_chunks_their_order_and_threads_leave_no_trace(rng):

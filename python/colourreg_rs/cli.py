@@ -331,8 +331,8 @@ def _evaluate(
     quiet: bool = False,
 ) -> None:
     """Assesses, prints (unless ``quiet``), and writes what was asked for."""
-    from .advice import advice
-    from .assessment_run import assess_registration, text_of
+    from .accuracy.advice import advice
+    from .accuracy.assessment_run import assess_registration, text_of
 
     with terminal_bars() as progress:
         assessed, photos = assess_registration(

@@ -12,12 +12,12 @@ import numpy.typing as npt
 
 from . import _core
 from .colourise import ColouriseResult, colourise_file
-from .correspondences import supported_scale
 from .io.atomic import write_text
 from .io.clouds import open_cloud, read_cloud, write_cloud
 from .io.images import read_photo, write_image
 from .io.points import write_points
 from .io.registration import read_registration, write_camera, write_registration
+from .matching.correspondences import supported_scale
 from .model import FloatArray, PointCloud, Registration, View
 from .pictures import bird_view, draw_cloud, overlay
 from .progress import Progress, silent

@@ -15,7 +15,8 @@ from typing import Any, Literal
 import numpy as np
 
 from . import _core
-from .doubts import contradictions
+from .accuracy.doubts import contradictions
+from .accuracy.view_adjustment import AdjustedView, PointSigmas, adjust_control, rotation_priors
 from .errors import DegenerateError, FileError, InvalidInputError, NotConvergedError
 from .evaluate import ViewEvaluation, evaluate_view, table
 from .io.clouds import open_cloud
@@ -23,7 +24,6 @@ from .io.images import PhotoInfo, photo_info
 from .io.points import read_points
 from .io.registration import read_camera, read_registration, write_registration
 from .model import DLT_DISTORTION_NAMES, Camera, ControlPoint, Covariance, Pose, Registration, View
-from .view_adjustment import AdjustedView, PointSigmas, adjust_control, rotation_priors
 
 #: The focal length, in units of the photo's long side, that a photo without EXIF is first taken to have.
 ORDINARY_FOCAL = 0.85
@@ -385,7 +385,7 @@ def _by_sci(cloud: Path, photo: Path, start: _Start, options: RegisterOptions) -
     """From the approximate view, without control points. A result that cannot be trusted is an error."""
     from .io.clouds import read_cloud
     from .io.images import read_photo
-    from .register_sci import SciOptions, register_sci
+    from .matching.register_sci import SciOptions, register_sci
 
     if start.pose is None:
         raise InvalidInputError("method sci starts from an approximate view: give a registration with --init")

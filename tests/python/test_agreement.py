@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from colourreg_rs import Covariance, PointCloud, Pose, View
-from colourreg_rs.agreement import agreements, cloud_against_photo, photo_against_photo
-from colourreg_rs.correspondences import PhotoPyramid
+from colourreg_rs.accuracy.agreement import agreements, cloud_against_photo, photo_against_photo
+from colourreg_rs.matching.correspondences import PhotoPyramid
 from colourreg_rs.simulate import Disturbance, simulate
 
 

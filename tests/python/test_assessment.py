@@ -10,9 +10,9 @@ import pytest
 from adjustment_cases import CAMERA, POSE, case
 
 from colourreg_rs import ControlPoint, Covariance, View, _core
-from colourreg_rs.advice import advice, headline
-from colourreg_rs.assessment import assess_view, error_map
-from colourreg_rs.view_adjustment import PointSigmas, adjust_control
+from colourreg_rs.accuracy.advice import advice, headline
+from colourreg_rs.accuracy.assessment import assess_view, error_map
+from colourreg_rs.accuracy.view_adjustment import PointSigmas, adjust_control
 
 
 def registered(points: list[ControlPoint], *, sigma_xy=None, sigma_xyz=None, start=None) -> View:

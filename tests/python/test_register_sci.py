@@ -8,8 +8,8 @@ import pytest
 
 from colourreg_rs import Camera, InvalidInputError, PointCloud, Pose, View, _core
 from colourreg_rs.experiments.sci_accuracy import STARTS, disturbed, register, simulated
-from colourreg_rs.match_covariance import design, match_covariance
-from colourreg_rs.register_sci import SciOptions, register_sci
+from colourreg_rs.matching.match_covariance import design, match_covariance
+from colourreg_rs.matching.register_sci import SciOptions, register_sci
 
 
 @pytest.mark.slow

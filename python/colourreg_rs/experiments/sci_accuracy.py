@@ -25,8 +25,8 @@ import numpy as np
 import numpy.typing as npt
 
 from .. import _core
+from ..matching.register_sci import SciOptions, SciRegistration, register_sci
 from ..model import FloatArray, PointCloud, Pose, View
-from ..register_sci import SciOptions, SciRegistration, register_sci
 from ..sci import render_sci, with_size
 
 #: χ² with six degrees of freedom holds 95 % below this.

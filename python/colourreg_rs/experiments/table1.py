@@ -17,9 +17,9 @@ import numpy.typing as npt
 
 from .. import _core
 from ..backproject import exact_depths
+from ..matching.register_sci import SciOptions, SciRegistration, register_sci
 from ..model import Camera, FloatArray, PointCloud, Pose, View
 from ..progress import Progress, silent
-from ..register_sci import SciOptions, SciRegistration, register_sci
 from ..sci import SCI, render_sci
 from ..simulate import Simulation, simulate
 from ..simulate.photo import Response, develop, radiance

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from .. import _core
+from ..matching.register_sci import SciOptions, register_sci
 from ..model import FloatArray, View
 from ..progress import Progress, silent
-from ..register_sci import SciOptions, register_sci
 from ..simulate import SimulatedPhoto, Simulation, simulate
 from .figures import Figures, table
 

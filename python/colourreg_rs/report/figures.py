@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from ..agreement import Agreement
-from ..assessment import LEAST_COVER, ErrorMap, ViewAssessment
+from ..accuracy.agreement import Agreement
+from ..accuracy.assessment import LEAST_COVER, ErrorMap, ViewAssessment
+from ..accuracy.surface_picture import SurfacePicture
 from ..model import FloatArray
-from ..surface_picture import SurfacePicture
 
 #: Inches: on a phone as wide as the screen, at a desk two beside each other, with letters of readable size in both.
 SIZE = (5.0, 3.5)
@@ -207,7 +207,7 @@ def sigma_histogram(picture: SurfacePicture) -> str | None:
     """How ColourSigma is distributed, as an angle, beside what others reach."""
     if picture.angle is None or not np.isfinite(picture.angle).any():
         return None
-    from ..advice import MAKERS_MRAD, THIRD_PARTY_MRAD
+    from ..accuracy.advice import MAKERS_MRAD, THIRD_PARTY_MRAD
 
     values = 1e3 * picture.angle[np.isfinite(picture.angle)]
 

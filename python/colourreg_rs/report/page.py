@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
-from ..advice import advice, figure, headline
-from ..agreement import Agreement
-from ..assessment import ViewAssessment
+from ..accuracy.advice import advice, figure, headline
+from ..accuracy.agreement import Agreement
+from ..accuracy.assessment import ViewAssessment
 from ..evaluate import Accuracy, PointError
 from ..io.atomic import write_text
 from . import figures, pictures

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..assessment import ViewAssessment
+from ..accuracy.assessment import ViewAssessment
 from ..evaluate import PointError
 
 #: The long side of the embedded photo, px, and its quality.

@@ -19,7 +19,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from . import _core
+from .. import _core
+from ..errors import DegenerateError, InvalidInputError, NotConvergedError
+from ..model import Covariance, FloatArray, PointCloud, Pose, View
+from ..sci import SCI
 from .correspondences import (
     Correspondences,
     PhotoPyramid,
@@ -28,10 +31,7 @@ from .correspondences import (
     pixels_per_radian,
     supported_scale,
 )
-from .errors import DegenerateError, InvalidInputError, NotConvergedError
 from .match_covariance import design, match_covariance
-from .model import Covariance, FloatArray, PointCloud, Pose, View
-from .sci import SCI
 from .surfaces import Linearised, Surfaces, find_surfaces, joined
 
 #: The finest level has this many pixels per spacing of the points: matches err by a share of the level's pixel,

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from . import _core
-from .correspondences import supported_scale
-from .io.clouds import open_cloud
-from .model import FloatArray, PointCloud, View
-from .sci import SCI, render_sci, with_size
+from .. import _core
+from ..io.clouds import open_cloud
+from ..matching.correspondences import supported_scale
+from ..model import FloatArray, PointCloud, View
+from ..sci import SCI, render_sci, with_size
 
 #: The long side of the pictures, px: enough to look at, and quick.
 LONG_SIDE = 1100

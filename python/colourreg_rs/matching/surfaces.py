@@ -15,10 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from . import _core
+from .. import _core
+from ..model import FloatArray, PointCloud, View
+from ..sci import SCI, Float32Array, render_sci, with_size
 from .correspondences import PhotoPyramid, fill_gaps, grey_to_match, pixels_per_radian
-from .model import FloatArray, PointCloud, View
-from .sci import SCI, Float32Array, render_sci, with_size
 
 #: Templates of 2 HALF + 1 px a side, the same px apart: larger ones mix surfaces, smaller ones tell too little.
 HALF = 14

@@ -19,8 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from . import _core
-from .correspondences import (
+from .. import _core
+from ..errors import DegenerateError
+from ..matching.correspondences import (
     Correspondences,
     PhotoPyramid,
     Search,
@@ -28,9 +29,8 @@ from .correspondences import (
     pixels_per_radian,
     supported_scale,
 )
-from .errors import DegenerateError
-from .match_covariance import design
-from .model import FloatArray, PointCloud, View
+from ..matching.match_covariance import design
+from ..model import FloatArray, PointCloud, View
 
 #: Significance of the test of the field.
 ALPHA = 0.01

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from ..errors import FileError, InvalidInputError
+from ..evaluate import table
+from ..io.images import read_photo
+from ..model import ControlPoint, Registration
+from ..progress import Progress, silent
 from .advice import advice, figure, headline, in_all_units
 from .assessment import CHECK_ALPHA, ViewAssessment, assess, at_depth, next_points_on
-from .errors import FileError, InvalidInputError
-from .evaluate import table
-from .io.images import read_photo
-from .model import ControlPoint, Registration
-from .progress import Progress, silent
 
 
 def assess_registration(

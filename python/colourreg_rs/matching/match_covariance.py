@@ -18,8 +18,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from . import _core
-from .model import Covariance, FloatArray, View
+from .. import _core
+from ..model import Covariance, FloatArray, View
 
 #: The distance over which matches err together, as one sigma of a Gaussian and a share of the photo's long side.
 CORRELATION_LENGTH = 0.18

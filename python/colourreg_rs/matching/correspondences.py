@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from . import _core
-from .model import FloatArray, PointCloud, View
-from .sci import LUMINANCE, SCI, Float32Array, points_of, render_sci, with_size
+from .. import _core
+from ..model import FloatArray, PointCloud, View
+from ..sci import LUMINANCE, SCI, Float32Array, points_of, render_sci, with_size
 
 #: No match is more precise than this, px of the level: what is left of the SCI's own grid.
 FLOOR = 0.05

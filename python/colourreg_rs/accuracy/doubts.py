@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .model import ControlPoint, View
+from ..model import ControlPoint, View
 
 #: A check point farther off than this many times the fit's own RMS, and than this share of the photo's diagonal,
 #: contradicts the view.

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from . import _core
-from .correspondences import pixels_per_radian
-from .errors import DegenerateError, InvalidInputError
-from .evaluate import ViewEvaluation, evaluate_view
-from .model import ControlPoint, FloatArray, Registration, View
+from .. import _core
+from ..errors import DegenerateError, InvalidInputError
+from ..evaluate import ViewEvaluation, evaluate_view
+from ..matching.correspondences import pixels_per_radian
+from ..model import ControlPoint, FloatArray, Registration, View
 from .view_adjustment import NOMINAL_SIGMA, PointSigmas, plain
 
 if TYPE_CHECKING:

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from . import _core
-from .errors import DegenerateError, NotConvergedError
-from .model import ControlPoint, Covariance, FloatArray
+from .. import _core
+from ..errors import DegenerateError, NotConvergedError
+from ..model import ControlPoint, Covariance, FloatArray
 
 #: Sigma of a photo coordinate, px, that gives the weights their unit where nobody knows it.
 NOMINAL_SIGMA = 0.5

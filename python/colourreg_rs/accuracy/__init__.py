@@ -1,0 +1,1 @@
+"""How good a registration is: adjustment and tests, doubts, evaluation with and without control points, advice."""

@@ -192,19 +192,47 @@ fn closed(grid: &Grid, limit: &[f32]) -> Vec<f32> {
     let mut closed = vec![0.0_f32; limit.len()];
     closed.par_chunks_mut(stride).enumerate().skip(2).take(grid.rows() - 4).for_each(|(y, row)| {
         let rows: [&[f32]; 5] = std::array::from_fn(|k| &limit[(y + k - 2) * stride..][..stride]);
-        for (x, value) in row[..stride - 2].iter_mut().enumerate().skip(2) {
-            let larger = |a: f32, b: f32| if a > b { a } else { b };
-            let smaller = |a: f32, b: f32| if a < b { a } else { b };
-            let a = smaller(larger(rows[2][x + 1], rows[2][x + 2]), larger(rows[2][x - 1], rows[2][x - 2]));
-            let b = smaller(larger(rows[3][x], rows[4][x]), larger(rows[1][x], rows[0][x]));
-            let c = smaller(larger(rows[3][x + 1], rows[4][x + 2]), larger(rows[1][x - 1], rows[0][x - 2]));
-            let d = smaller(larger(rows[3][x - 1], rows[4][x - 2]), larger(rows[1][x + 1], rows[0][x + 2]));
-            // The second largest of the four.
-            let cover = larger(smaller(larger(a, b), larger(c, d)), larger(smaller(a, b), smaller(c, d)));
-            *value = larger(rows[2][x], cover);
+        #[cfg(target_arch = "x86_64")]
+        if std::arch::is_x86_feature_detected!("avx2") {
+            // SAFETY: the processor has the feature.
+            return unsafe { close_row_avx2(&rows, row) };
         }
+        close_row(&rows, row);
     });
     closed
+}
+
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2")]
+unsafe fn close_row_avx2(rows: &[&[f32]; 5], row: &mut [f32]) {
+    close_row(rows, row);
+}
+
+#[inline(always)]
+fn larger(a: f32, b: f32) -> f32 {
+    if a > b { a } else { b }
+}
+
+#[inline(always)]
+fn smaller(a: f32, b: f32) -> f32 {
+    if a < b { a } else { b }
+}
+
+/// One row of [`closed`], from five rows of limits about it.
+#[inline(always)]
+fn close_row(rows: &[&[f32]; 5], row: &mut [f32]) {
+    let n = row.len();
+    // Of one length, so that nothing is left to check in the loop.
+    let (r0, r1, r2, r3, r4) = (&rows[0][..n], &rows[1][..n], &rows[2][..n], &rows[3][..n], &rows[4][..n]);
+    for x in 2..n - 2 {
+        let a = smaller(larger(r2[x + 1], r2[x + 2]), larger(r2[x - 1], r2[x - 2]));
+        let b = smaller(larger(r3[x], r4[x]), larger(r1[x], r0[x]));
+        let c = smaller(larger(r3[x + 1], r4[x + 2]), larger(r1[x - 1], r0[x - 2]));
+        let d = smaller(larger(r3[x - 1], r4[x - 2]), larger(r1[x + 1], r0[x + 2]));
+        // The second largest of the four.
+        let cover = larger(smaller(larger(a, b), larger(c, d)), larger(smaller(a, b), smaller(c, d)));
+        row[x] = larger(r2[x], cover);
+    }
 }
 
 fn band_count(grid: &Grid) -> usize {
@@ -283,15 +311,17 @@ impl Rule {
         let floor = tolerance.unwrap_or(1e-4 + 3.0 * self.noise * own) + 0.3 * self.pixel_angle;
         let slack = own * floor + 0.25 * patch.misfit() + across * (gx.abs() + gy.abs());
         let spacing = patch.spacing().unwrap_or(0.0);
-        let [east, south, west, north]: [f32; QUADRANTS] = std::array::from_fn(|k| {
+        let mut covered = [0.0_f32; QUADRANTS];
+        for (k, covered) in covered.iter_mut().enumerate() {
             let (link, opposite) = (&patch.links[k], &patch.links[(k + 2) % QUADRANTS]);
-            let covered = match (link.found(), opposite.found()) {
+            let reach = match (link.found(), opposite.found()) {
                 (true, _) => inner * link.distance,
                 (false, true) => OUTER.0 * opposite.distance - OUTER.1,
                 (false, false) => OUTER.0 * spacing - OUTER.1,
             };
-            covered.max(LEAST).min(MAX_REACH as f32 - 1.0)
-        });
+            *covered = reach.max(LEAST).min(MAX_REACH as f32 - 1.0);
+        }
+        let [east, south, west, north] = covered;
         let stride = grid.stride();
         let (column, row) = ((cell as u32 % stride as u32) as usize, (cell as u32 / stride as u32) as usize);
         let [right, down] = patch.place;

@@ -258,14 +258,15 @@ impl<'a> Surroundings<'a> {
     pub fn patch(&self, links: &Links) -> Patch {
         let sample = self.samples[links.cell as usize];
         let (own, place, stride) = (sample.inverse_depth(), sample.place(), self.grid.stride() as isize);
-        let link = |near: (i8, i8)| {
-            if near == NONE {
-                return Link::default();
+        // A loop: a closure given to the array's own `map` would not be compiled for the wide registers.
+        let mut found = [Link::default(); QUADRANTS];
+        for (found, &near) in found.iter_mut().zip(&links.near) {
+            if near != NONE {
+                let at = links.cell as isize + isize::from(near.1) * stride + isize::from(near.0);
+                *found = self.link(own, place, self.samples[at as usize], near);
             }
-            let at = links.cell as isize + isize::from(near.1) * stride + isize::from(near.0);
-            self.link(own, place, self.samples[at as usize], near)
-        };
-        Patch { own, place, links: links.near.map(link) }
+        }
+        Patch { own, place, links: found }
     }
 
     #[inline(always)]

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from . import _core
+from .accuracy.assessment_run import assess_registration
 from .colourise import ColouriseResult, colourise_file
 from .io.atomic import write_text
 from .io.clouds import open_cloud, read_cloud, write_cloud
@@ -22,6 +23,7 @@ from .model import FloatArray, PointCloud, Registration, View
 from .pictures import bird_view, draw_cloud, overlay
 from .progress import Progress, silent
 from .register import RegisterOptions, register_photo
+from .report import write_report
 from .sci import render_sci, with_size
 from .simulate import Disturbance, SimulatedPhoto, Simulation, simulate
 
@@ -110,7 +112,7 @@ class DemoResult:
 def run_demo(folder: Path, *, seed: int = 0, progress: Progress = silent) -> DemoResult:
     """Simulates, registers, colours and compares with the truth; everything it makes lies in ``folder``."""
     folder.mkdir(parents=True, exist_ok=True)
-    steps = 6
+    steps = 7
     progress("demo: simulating", 0, steps)
     errors = Disturbance(blunders=0.15, control_points=16, check_points=6)
     simulation = simulate("demo", seed=seed, disturbance=errors, size=_PHOTO_SIZE, samples=_SAMPLES)
@@ -131,6 +133,8 @@ def run_demo(folder: Path, *, seed: int = 0, progress: Progress = silent) -> Dem
     truths = tuple(_view_truth(simulation, p, v, chosen) for p, v in zip(simulation.photos, views, strict=True))
     progress("demo: drawing", 5, steps)
     pictures = _draw(folder, coloured, views, np.array(simulation.stations[0]))
+    progress("demo: reporting", 6, steps)
+    pictures = (*pictures, *(_report(folder, path) for path in registrations))
     progress("demo: done", steps, steps)
     return DemoResult(folder, len(simulation.scan), truths, colours, result, pictures)
 
@@ -144,6 +148,15 @@ def _register(folder: Path, photo: SimulatedPhoto) -> Path:
     write_camera(camera, photo.view.camera)
     register_photo(folder / "scan.laz", image, points=points, camera=camera, options=RegisterOptions()).save(out)
     return out
+
+
+def _report(folder: Path, registration: Path) -> str:
+    """The page that says how good the view is, for people."""
+    cloud = folder / "scan.laz"
+    assessed, photos = assess_registration(read_registration(registration), registration, None, cloud, pictures=True)
+    name = registration.name.replace("-registration.json", "-report.html")
+    write_report(folder / name, assessed, photos, title=registration.stem, cloud=cloud.name)
+    return name
 
 
 def _write_truth(folder: Path, simulation: Simulation) -> None:

@@ -60,7 +60,7 @@ class RegisterResult:
     """A registration of one view, how well it fits, and every doubt about it."""
 
     registration: Registration
-    evaluation: ViewEvaluation
+    evaluation: ViewEvaluation | None
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     doubts: tuple[str, ...] = ()
@@ -85,7 +85,9 @@ class RegisterResult:
         """A few lines for people."""
         view = self.view
         s = view.statistics
-        lines = [*self.notes, table([self.evaluation])]
+        lines = [*self.notes]
+        if self.evaluation is not None:  # matches with the SCI are no points to be evaluated at
+            lines.append(table([self.evaluation]))
         if "sigma0" in s:
             lines.append(f"sigma0 {s['sigma0']:.3f}, {s['dof']:g} degrees of freedom")
         elif "dof" in s:
@@ -119,7 +121,7 @@ class RegisterResult:
             "dlt": view.dlt.tolist() if view.dlt is not None else None,
             "sigmas": {n: view.covariance.sigma(n) for n in view.covariance.parameters} if view.covariance else None,
             "statistics": dict(view.statistics),
-            "evaluation": self.evaluation.as_dict(),
+            "evaluation": self.evaluation.as_dict() if self.evaluation is not None else None,
             **self.facts,
         }
 
@@ -399,7 +401,7 @@ def _by_sci(cloud: Path, photo: Path, start: _Start, options: RegisterOptions) -
     last = found.turns[-1]
     return RegisterResult(
         registration=Registration((found.view,), cloud, points.crs_wkt),
-        evaluation=evaluate_view(found.view),
+        evaluation=None,
         notes=(f"{start.origin}; free: {', '.join(free)}",),
         free=free,
         facts={

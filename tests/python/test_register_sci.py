@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import cv2
 import numpy as np
 import pytest
 
 from colourreg_rs import Camera, InvalidInputError, PointCloud, Pose, View, _core
 from colourreg_rs.experiments.sci_accuracy import STARTS, disturbed, register, simulated
+from colourreg_rs.io.clouds import write_cloud
+from colourreg_rs.io.images import write_image
+from colourreg_rs.io.registration import read_registration, write_registration
 from colourreg_rs.matching.match_covariance import design, match_covariance
 from colourreg_rs.matching.register_sci import SciOptions, register_sci
+from colourreg_rs.model import Registration
+from colourreg_rs.simulate import simulate
 
 
 @pytest.mark.slow
@@ -75,3 +83,22 @@ def test_the_covariance_meets_the_scatter_of_correlated_matches(rng):
         independent.append(error @ (rows.T @ rows / sigma**2) @ error < 12.59)
     assert np.mean(inside) > 0.8
     assert np.mean(independent) < 0.3
+
+
+@pytest.mark.slow
+def test_the_command_writes_what_it_found(tmp_path):
+    simulation = simulate("room", seed=0, photos=1, size=(900, 600), samples=4)
+    photo = simulation.photos[0]
+    write_cloud(tmp_path / "scan.laz", simulation.scan)
+    write_image(tmp_path / "photo.png", photo.image)
+    start = View("photo", tmp_path / "photo.png", photo.view.camera, photo.view.pose)
+    write_registration(tmp_path / "start.json", Registration((start,), tmp_path / "scan.laz"))
+    command = ["register", "scan.laz", "photo.png", "--method", "sci", "--init", "start.json", "--out", "found.json"]
+    done = subprocess.run(
+        [sys.executable, "-m", "colourreg_rs.cli", *command], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "matches_used" in done.stdout
+    found = read_registration(tmp_path / "found.json").views[0]
+    assert found.method == "sci" and found.covariance is not None
+    assert np.linalg.norm(found.pose.centre - photo.view.pose.centre) < 0.02

@@ -279,6 +279,10 @@ def colourise(
     max_sigma: Annotated[
         float | None, typer.Option(help="Metres of ColourSigma beyond which nothing is coloured.")
     ] = None,
+    tolerance: Annotated[
+        float | None,
+        typer.Option(help="Noise of the cloud's depths, in parts of the depth: 0.003; for depth cameras 0.01."),
+    ] = None,
     level: Annotated[bool, typer.Option(help="Level exposure and white balance between photos.")] = False,
     chunk: Annotated[int, typer.Option(help="Points held at a time.", min=1000)] = 1_000_000,
     json_file: JsonOption = None,
@@ -291,6 +295,7 @@ def colourise(
         sampling=sampling.value,
         max_distance=max_distance,
         max_sigma=max_sigma,
+        tolerance=tolerance,
         level_exposure=level,
         chunk_size=chunk,
     )

@@ -71,6 +71,9 @@ class View:
     def max_angle(self) -> float:
         """The angle from the optical axis, radians, beyond which the lens model folds back and nothing is visible."""
 
+    def meets(self, xyz: FloatArray) -> bool:
+        """Whether any point of the smallest box around these (N, 3) may lie in the photo. ``False`` is certain."""
+
     def matrix(self) -> FloatArray | None:
         """``K [R | -R C]`` (3, 4), without distortion; ``None`` for fisheye and panorama."""
 

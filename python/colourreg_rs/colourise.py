@@ -1,8 +1,8 @@
 """Colours of photos onto a cloud, in two passes over chunks.
 
 The first pass puts every point into each photo's depth buffer, the second colours each chunk against the finished
-buffers. Memory holds the buffers, the photos and a few chunks, whatever the cloud's size; the output depends neither on
-the size of the chunks nor on the number of threads.
+buffers. Memory holds the buffers, the photos in use and a few chunks, whatever the cloud's size; the output depends
+neither on the size of the chunks nor on the number of threads.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -23,6 +24,7 @@ from .io.images import photo_info, read_photo
 from .io.registration import read_registration
 from .model import FloatArray, View
 from .overlap import Behind, prefetched
+from .photos import PHOTO_MEMORY, PhotoShelf
 from .progress import Progress, silent
 
 
@@ -34,6 +36,7 @@ class ColouriseOptions:
     ColourSigma beside the view's covariance. Points whose ColourSigma exceeds ``max_sigma`` stay uncoloured.
     ``tolerance`` is the noise of the cloud's depths in parts of the depth: what is in front by less hides nothing. The
     default of 0.003 suits laser scans; clouds of depth cameras and of photogrammetry want about 0.01.
+    ``photo_memory`` (bytes) is what photos that are not in use just now may take; see :mod:`colourreg_rs.photos`.
     """
 
     blend: Literal["best", "mean", "median"] = "best"
@@ -45,6 +48,7 @@ class ColouriseOptions:
     sigma_xyz: float = 0.002
     level_exposure: bool = False
     chunk_size: int = 1_000_000
+    photo_memory: int = PHOTO_MEMORY
 
 
 @dataclass(frozen=True)
@@ -123,7 +127,7 @@ class Colouriser:
             raise InvalidInputError("there is no view to colour from")
         self.views = tuple(views)
         self.options = options or ColouriseOptions()
-        self._photos: list[npt.NDArray[Any]] = []
+        self._photos = PhotoShelf((), ())
         limits = {"max_distance": self.options.max_distance, "tolerance": self.options.tolerance}
         self._buffers = [_core.DepthBuffer(view.core, **limits) for view in self.views]
         self._maps: list[_core.VisibilityMap] = []
@@ -141,22 +145,26 @@ class Colouriser:
         for buffer in self._buffers:
             buffer.add(xyz)
 
-    def finish(self, photos: Sequence[npt.NDArray[Any]]) -> None:
+    def finish(self, photos: Sequence[npt.NDArray[Any]] | PhotoShelf) -> None:
         """Between the passes: surfaces are made of the points that were seen.
 
         Args:
-            photos: (H, W, 3) uint8 or uint16, those of the views, in their order.
+            photos: (H, W, 3) uint8 or uint16, those of the views, in their order; or a shelf of them.
         """
         if len(photos) != len(self.views):
             raise InvalidInputError(f"{len(photos)} photos for {len(self.views)} views")
         self._maps = [buffer.finish() for buffer in self._buffers]
         self._buffers = []
-        self._photos = [np.ascontiguousarray(photo) for photo in photos]
+        self._photos = photos if isinstance(photos, PhotoShelf) else PhotoShelf.of(photos)
+
+    def _photos_of(self, xyz: FloatArray) -> list[npt.NDArray[Any]]:
+        """The photos that the chunk may lie in; of the others nothing is looked at."""
+        return self._photos.take({i for i, view in enumerate(self.views) if view.core.meets(xyz)})
 
     def compare(self, xyz: FloatArray) -> None:
         """What several photos see of the chunk tells how their exposures differ."""
         assert self._exposure is not None
-        self._exposure.add(self._maps, self._photos, xyz)
+        self._exposure.add(self._maps, self._photos_of(xyz), xyz)
 
     def colour(self, xyz: FloatArray) -> ColouredChunk:
         """Second pass. Points that no photo sees have source 0 and an undefined colour."""
@@ -164,7 +172,7 @@ class Colouriser:
             self._gains = self._exposure.gains()
         options = self.options
         rgb, source = _core.colour_points(
-            self._maps, self._photos, xyz, sampling=options.sampling, blend=options.blend, gains=self._gains
+            self._maps, self._photos_of(xyz), xyz, sampling=options.sampling, blend=options.blend, gains=self._gains
         )
         sigma = np.full(len(xyz), np.nan, np.float32)
         for number, surface in enumerate(self._sigmas, 1):
@@ -209,6 +217,10 @@ def _pixels(view: View) -> npt.NDArray[Any]:
     return read_photo(view.image).pixels
 
 
+def _sizes(views: Sequence[View]) -> list[tuple[int, int]]:
+    return [(view.core.width, view.core.height) for view in views]
+
+
 def colourise_file(
     cloud: str | Path,
     registrations: Sequence[str | Path],
@@ -229,9 +241,10 @@ def colourise_file(
         colouriser = Colouriser(views, options)
         # The first pass needs no photo: they are decoded behind it.
         with ThreadPoolExecutor(1, thread_name_prefix="colourreg-photos") as decoder:
-            photos = [decoder.submit(_pixels, view) for view in views]
+            photos = PhotoShelf([partial(_pixels, view) for view in views], _sizes(views), options.photo_memory)
+            filled = decoder.submit(photos.fill)
             try:
-                low, high = _first_pass(reader, colouriser, photos, progress)
+                low, high = _first_pass(reader, colouriser, photos, filled, progress)
             except BaseException:
                 decoder.shutdown(wait=False, cancel_futures=True)
                 raise
@@ -265,7 +278,7 @@ def _positions(reader: CloudReader, options: ColouriseOptions) -> Iterator[Cloud
 
 
 def _first_pass(
-    reader: CloudReader, colouriser: Colouriser, photos: Sequence[Future[npt.NDArray[Any]]], progress: Progress
+    reader: CloudReader, colouriser: Colouriser, photos: PhotoShelf, filled: Future[None], progress: Progress
 ) -> tuple[FloatArray, FloatArray]:
     """Fills and finishes the buffers; gives the cloud's extent."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
@@ -274,7 +287,8 @@ def _first_pass(
         colouriser.see(chunk.xyz)
         low, high = np.fmin(low, np.fmin.reduce(chunk.xyz)), np.fmax(high, np.fmax.reduce(chunk.xyz))
         progress("finding what hides what", chunk.start + len(chunk), total)
-    colouriser.finish([photo.result() for photo in photos])
+    colouriser.finish(photos)
+    filled.result()
     if colouriser.levels:
         for chunk in _positions(reader, colouriser.options):
             colouriser.compare(chunk.xyz)

@@ -25,9 +25,9 @@ def describe(path: Path) -> dict[str, Any]:
     if suffix == ".csv":
         return {"file": str(path), **_describe_points(path)}
     if suffix in PHOTO_SUFFIXES:
-        from .io.images import photo_info
+        from .io.images import whole_photo_info
 
-        photo = photo_info(path)
+        photo = whole_photo_info(path)
         return {
             "file": str(path),
             "kind": "photo",

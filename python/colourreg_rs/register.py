@@ -20,7 +20,7 @@ from .accuracy.view_adjustment import AdjustedView, PointSigmas, adjust_control,
 from .errors import DegenerateError, FileError, InvalidInputError, NotConvergedError
 from .evaluate import ViewEvaluation, evaluate_view, table
 from .io.clouds import open_cloud
-from .io.images import PhotoInfo, photo_info
+from .io.images import PhotoInfo, photo_info, whole_photo_info
 from .io.points import read_points
 from .io.registration import read_camera, read_registration, write_registration
 from .model import DLT_DISTORTION_NAMES, Camera, ControlPoint, Covariance, Pose, Registration, View
@@ -167,7 +167,7 @@ def register_photo(
     """
     options = options or RegisterOptions()
     cloud, photo = Path(cloud), Path(photo)
-    info = photo_info(photo)
+    info = whole_photo_info(photo)
     if options.method == "sci":
         start = _starting_view(photo, info, Path(init) if init else None, Path(camera) if camera else None)
         return _by_sci(cloud, photo, start, options)
@@ -242,9 +242,8 @@ def _starting_view(photo: Path, info: PhotoInfo, init: Path | None, camera: Path
 
 def _outside(control: Sequence[ControlPoint], reader: Any, path: Path) -> tuple[str, ...]:
     """Control points far from the cloud are of another frame: refused; a little outside is worth a warning."""
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for chunk in reader.chunks(positions_only=True):
-        low, high = np.fmin(low, np.fmin.reduce(chunk.xyz)), np.fmax(high, np.fmax.reduce(chunk.xyz))
+    told = reader.told_extent() or reader.extent()
+    low, high = told.low, told.high
     xyz = np.stack([p.xyz for p in control])
     size = float(np.linalg.norm(high - low))
     beyond = np.linalg.norm(np.maximum(np.maximum(low - xyz, xyz - high), 0), axis=1)

@@ -6,7 +6,7 @@ use pyo3::prelude::*;
 use pyo3::types::PyType;
 
 use super::arrays::{Input, Output, matrix, owned, owned_rows, points2, points3, vector};
-use crate::geometry::{self, Camera, DltParts, Model, Pose};
+use crate::geometry::{self, Camera, DltParts, Frustum, Model, Pose};
 
 #[pyclass(frozen, name = "View", module = "colourreg_rs._core")]
 pub(super) struct PyView(pub geometry::View);
@@ -89,6 +89,12 @@ impl PyView {
     #[getter]
     fn max_angle(&self) -> f64 {
         self.0.camera.max_angle()
+    }
+
+    fn meets(&self, py: Python<'_>, xyz: &Bound<'_, PyAny>) -> PyResult<bool> {
+        let input = points3(xyz, "xyz")?;
+        let points = input.rows::<3>()?;
+        Ok(py.detach(|| Frustum::new(&self.0, 0.0).meets(points)))
     }
 
     fn matrix<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyArray2<f64>>>> {

@@ -12,7 +12,7 @@ import pytest
 
 from colourreg_rs import Camera, ControlPoint, PointCloud, Pose, View, _core
 from colourreg_rs.io.clouds import open_cloud, read_cloud, write_cloud
-from colourreg_rs.io.images import write_image
+from colourreg_rs.io.images import read_photo, write_image
 from colourreg_rs.io.points import read_points, write_points
 from colourreg_rs.io.registration import read_registration, write_camera
 
@@ -45,6 +45,19 @@ def job(tmp_path_factory):
     ]
     write_points(folder / "points.csv", points)
     return folder
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif"])
+def test_a_photo_that_is_cut_off_is_refused_before_anything_is_done(job, tmp_path, suffix):
+    photo, out = tmp_path / f"photo{suffix}", tmp_path / "registration.json"
+    write_image(photo, read_photo(job / "photo.png").pixels)
+    data = photo.read_bytes()
+    photo.write_bytes(data[: int(0.8 * len(data))])
+    register = ["--points", job / "points.csv", "--camera", job / "camera.json", "--out", out]
+    for command in (["info", photo], ["register", job / "scan.laz", photo, *register]):
+        done = colourreg(*command)
+        assert done.returncode == 1 and not out.exists()
+        assert len(done.stderr.splitlines()) == 1 and str(photo) in done.stderr
 
 
 def test_register_colourise_evaluate(job):

@@ -10,7 +10,15 @@ from PIL import Image
 
 from colourreg_rs import FileError, InvalidInputError
 from colourreg_rs.io import images
-from colourreg_rs.io.images import focal_in_pixels, photo_info, read_photo, upright, write_image, write_png
+from colourreg_rs.io.images import (
+    focal_in_pixels,
+    photo_info,
+    read_photo,
+    upright,
+    whole_photo_info,
+    write_image,
+    write_png,
+)
 
 
 def picture(rng: np.random.Generator, dtype: type, channels: int = 3, shape: tuple[int, int] = (37, 53)) -> np.ndarray:
@@ -304,9 +312,12 @@ def test_truncated_photos_are_refused_in_one_line(tmp_path, rng, kind):
     spare = {"jpg": 2, "png": 24, "tif": 1}[kind[:3]]
     for cut in sorted({*range(0, 300, 23), *np.linspace(300, len(whole) - spare - 1, 25).astype(int)}):
         path.write_bytes(whole[:cut])
-        with pytest.raises(FileError) as caught:
-            read_photo(path)
-        assert "\n" not in str(caught.value)
+        for read in (read_photo, whole_photo_info):
+            with pytest.raises(FileError) as caught:
+                read(path)
+            assert "\n" not in str(caught.value)
+    path.write_bytes(whole)
+    assert whole_photo_info(path) == photo_info(path)
 
 
 @pytest.mark.parametrize("kind", ["jpg", "png", "png16", "tif", "tif16"])

@@ -162,6 +162,10 @@ class CloudReader(ABC):
             return bits_of(chunk.rgb)
         return None
 
+    def told_extent(self) -> Extent | None:
+        """What the file says of its extent, where a look at some points bears it out; only they are read for it."""
+        return None
+
     def extent(self) -> Extent:
         """Goes through all points once."""
         low, high, invalid = np.full(3, np.inf), np.full(3, -np.inf), 0

@@ -82,6 +82,28 @@ def photo_info(path: str | Path) -> PhotoInfo:
         return _info(path, file, image)
 
 
+def whole_photo_info(path: str | Path) -> PhotoInfo:
+    """As :func:`photo_info`, after making sure that the pixels are all there, in some tenths of a second at most.
+
+    A JPEG is decoded at an eighth of its size, which reads all of its data; a PNG must end as one ends; the strips of a
+    TIFF must lie in the file.
+
+    Raises:
+        FileError: as :func:`photo_info`, and where the file is cut off or does not decode.
+    """
+    path = Path(path)
+    with open_binary(path) as file, _opened(path, file) as image:
+        info = _info(path, file, image)
+        if info.format == "JPEG":
+            image.draft(image.mode, (image.width // 8, image.height // 8))
+            image.load()
+        elif info.format == "PNG":
+            _check_png(path, file)
+        else:
+            _check_tiff(path, file, image)
+    return info
+
+
 def read_photo(path: str | Path) -> Photo:
     """Decodes a photo and turns it upright by its EXIF orientation.
 
@@ -256,6 +278,31 @@ def _info(path: Path, file: IO[bytes], image: Image.Image) -> PhotoInfo:
     if focal is not None:
         exif["focal_px"] = focal
     return PhotoInfo(path, width, height, bits, image.mode, kind, exif)
+
+
+def _check_png(path: Path, file: IO[bytes]) -> None:
+    """A PNG is a row of chunks, each with its length and check sum, the last of them empty and named IEND."""
+    file.seek(8)
+    while True:
+        head = file.read(8)
+        if len(head) < 8:
+            raise FileError(path, "ends inside its pixels", _BROKEN)
+        content = file.read(int.from_bytes(head[:4], "big"))
+        check = file.read(4)
+        if len(check) < 4:
+            raise FileError(path, "ends inside its pixels", _BROKEN)
+        if zlib.crc32(head[4:] + content) != int.from_bytes(check, "big"):
+            raise FileError(path, f"has a damaged part ({head[4:].decode('latin-1')})", _BROKEN)
+        if head[4:] == b"IEND":
+            return
+
+
+def _check_tiff(path: Path, file: IO[bytes], image: Image.Image) -> None:
+    tags: Any = getattr(image, "tag_v2", {})
+    offsets, counts = (tags.get(a) or tags.get(b) or () for a, b in ((273, 324), (279, 325)))
+    size = file.seek(0, 2)
+    if not offsets or any(at + n > size for at, n in zip(offsets, counts, strict=False)):
+        raise FileError(path, "ends inside its pixels", _BROKEN)
 
 
 def _exif(image: Image.Image) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from .. import _core
 from ..errors import FileError
 from . import laz
 from .atomic import open_binary, reason, reopen
-from .clouds import CHUNK_SIZE, PIECE, AnyArray, Attribute, CloudChunk, CloudReader
+from .clouds import CHUNK_SIZE, PIECE, AnyArray, Attribute, CloudChunk, CloudReader, Extent
 from .las_header import (
     RAISED,
     RGB_OFFSET,
@@ -29,6 +29,9 @@ from .las_header import (
     read_header,
     take,
 )
+
+#: Points that are looked at to see whether the header's bounds can be believed.
+_LOOK = 50_000
 
 _NORMALS = (("NormalX", "NormalY", "NormalZ"), ("normal_x", "normal_y", "normal_z"), ("nx", "ny", "nz"))
 
@@ -117,6 +120,22 @@ class LasReader(CloudReader):
         if found["rgb_bits"] == 8:
             found["warnings"].append("colours are 8-bit values; LAS wants them times 256: viewers may show them black")
         return found
+
+    def told_extent(self) -> Extent | None:
+        low, high = (np.array(values) for values in self.header.bounds)
+        if not (np.isfinite(low).all() and np.isfinite(high).all() and (low <= high).all()):
+            return None
+        first = next(iter(self.chunks(_LOOK, positions_only=True)))
+        # Some writers leave the bounds of another file, or of nothing; others round them to a step of the coordinates.
+        step = np.abs(self.header.scale)
+        if (first.xyz < low - step).any() or (first.xyz > high + step).any():
+            return None
+        # Nor is a box believed that the points could not fill: it would hide what is far outside.
+        reach = np.abs(self.header.scale) * 2.0**31
+        offset = np.array(self.header.offset)
+        if (low < offset - reach - step).any() or (high > offset + reach + step).any():
+            return None
+        return Extent(low, high, 0)
 
     def chunks(self, size: int = CHUNK_SIZE, positions_only: bool = False) -> Iterator[CloudChunk]:
         size = max(1, int(size))

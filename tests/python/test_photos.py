@@ -1,0 +1,112 @@
+"""Photos are held while chunks lie in them; what is coloured does not depend on it, memory does."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from colourreg_rs import Camera, ColouriseOptions, Colouriser, PointCloud, Pose, Registration, View, write_registration
+from colourreg_rs.io.clouds import write_cloud
+from colourreg_rs.io.images import write_image
+from colourreg_rs.photos import PhotoShelf
+
+
+def ring(count: int, size: tuple[int, int]) -> list[View]:
+    """Views all around from one place, overlapping a little."""
+    width, height = size
+    f = 0.5 * width / np.tan(1.2 * np.pi / count)
+    params = {"fx": f, "fy": f, "cx": (width - 1) / 2, "cy": (height - 1) / 2}
+    angles = 2 * np.pi * (np.arange(count) + 0.5) / count
+    return [
+        View(
+            f"v{k}",
+            None,
+            Camera("PINHOLE", width, height, params),
+            Pose.looking_at([0, 0, 0], [np.cos(a), np.sin(a), 0]),
+        )
+        for k, a in enumerate(angles)
+    ]
+
+
+def panorama(n: int) -> np.ndarray:
+    """A round wall, column after column, as a scanner goes around."""
+    angle = 2 * np.pi * (np.arange(n) // 100) / (n // 100)
+    up = (np.arange(n) % 100) / 100 * 4 - 2
+    return np.column_stack([10 * np.cos(angle), 10 * np.sin(angle), up])
+
+
+@pytest.mark.parametrize("blend", ["best", "mean", "median"])
+@pytest.mark.parametrize("level", [False, True])
+def test_colours_do_not_depend_on_how_many_photos_are_held(rng, blend, level):
+    views, xyz = ring(8, (120, 90)), panorama(40_000)
+    photos = [rng.integers(0, 256, (90, 120, 3), dtype=np.uint8) for _ in views]
+    found, decoded = [], []
+    for limit in (8 * photos[0].nbytes, 3 * photos[0].nbytes, 0):
+        shelf = PhotoShelf([partial(np.copy, photo) for photo in photos], [(120, 90)] * 8, limit)
+        shelf.fill()
+        assert shelf.held_bytes <= limit
+        colouriser = Colouriser(views, ColouriseOptions(blend=blend, level_exposure=level))
+        chunks = [np.ascontiguousarray(part) for part in np.array_split(xyz, 20)]
+        for chunk in chunks:
+            colouriser.see(chunk)
+        colouriser.finish(shelf)
+        if level:
+            for chunk in chunks:
+                colouriser.compare(chunk)
+        colours = [colouriser.colour(chunk) for chunk in chunks]
+        found.append([np.concatenate([getattr(c, name) for c in colours]) for name in ("rgb", "source")])
+        decoded.append(shelf.decoded)
+        assert (found[-1][1] > 0).all() and set(found[-1][1]) == set(range(1, 9))
+    for rgb, source in found[1:]:
+        assert np.array_equal(rgb, found[0][0]) and np.array_equal(source, found[0][1])
+    # All at once; three are enough to go around, once in each pass; with none to spare neighbours are decoded again.
+    assert decoded[0] == 8 and decoded[0] < decoded[1] <= decoded[2]
+
+
+def test_arrays_stay_where_they_are(rng):
+    photos = [rng.integers(0, 256, (20, 30, 3), dtype=np.uint8) for _ in range(3)]
+    shelf = PhotoShelf.of(photos)
+    taken = shelf.take({1})
+    assert taken[1] is photos[1] and taken[0].shape == (20, 30, 3) and not taken[0].any()
+    assert shelf.take({0, 2})[2] is photos[2] and shelf.decoded == 0
+
+
+RUN = """
+import re, sys
+from pathlib import Path
+from colourreg_rs import ColouriseOptions, colourise_file
+options = ColouriseOptions(photo_memory=int(sys.argv[2]), chunk_size=20_000)
+folder = Path(sys.argv[1])
+colourise_file(folder / "scan.las", [folder / "registration.json"], folder / f"out-{sys.argv[2]}.las", options=options)
+print(re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_text())[1])
+"""
+
+
+@pytest.mark.slow
+def test_memory_is_that_of_the_photos_in_use(tmp_path, rng):
+    count, size = 24, (1500, 1000)
+    views = ring(count, size)
+    named = []
+    for k, view in enumerate(views):
+        path = tmp_path / f"{k}.jpg"
+        write_image(path, np.full((size[1], size[0], 3), 10 * k, np.uint8))
+        named.append(View(view.name, path, view.camera, view.pose))
+    write_cloud(tmp_path / "scan.las", PointCloud(panorama(400_000)))
+    write_registration(tmp_path / "registration.json", Registration(tuple(named)))
+    photo = 3 * size[0] * size[1]
+    peaks = {}
+    for limit in (count * photo, 4 * photo):
+        done = subprocess.run(
+            [sys.executable, "-c", RUN, str(tmp_path), str(limit)], capture_output=True, text=True, check=True
+        )
+        peaks[limit] = int(re.search(r"\d+", done.stdout)[0]) * 1024
+    most, few = peaks.values()
+    assert most - few > 0.7 * (count - 6) * photo, peaks
+    a, b = (Path(tmp_path / f"out-{limit}.las").read_bytes() for limit in peaks)
+    assert a == b

@@ -9,11 +9,16 @@ import numpy as np
 PARAMS = {"f": 0.725, "k1": -0.05, "k2": 0.01, "p1": 5e-4, "p2": -3e-4, "k3": 0.001}
 
 
-def cloud(points: int, order: str = "as scanned") -> np.ndarray:
-    """(N, 3), camera frame: each nearer wall hides a part of the farther ones. ``order``: as scanned, or shuffled."""
+def cloud(points: int, order: str = "as scanned", half: tuple[float, float] = (0.66, 0.44)) -> np.ndarray:
+    """(N, 3), camera frame: each nearer wall hides a part of the farther ones. ``order``: as scanned, or shuffled.
+
+    ``half``: how far to the side and up the scan goes, in parts of the depth.
+    """
     rng = np.random.default_rng(1)
     rows = int(np.sqrt(points * 3 / 4))
-    x, y = np.meshgrid(np.linspace(-0.66, 0.66, points // rows), np.linspace(-0.44, 0.44, rows), indexing="ij")
+    x, y = np.meshgrid(
+        np.linspace(-half[0], half[0], points // rows), np.linspace(-half[1], half[1], rows), indexing="ij"
+    )
     x, y = x.ravel(), y.ravel()
     depth = 8.0 + 6.0 * (np.floor(9 * (x + 0.72)).astype(int) % 4) + 0.2 * np.floor(20 * y)
     depth += rng.normal(0, 0.002, len(depth))

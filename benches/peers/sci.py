@@ -18,50 +18,20 @@ import time
 
 import numpy as np
 
+from . import building
 from .harness import compare, parser
 
 WIDTH, HEIGHT = 4000, 3000
-PARAMS = {
-    "fx": 2900.0, "fy": 2900.0, "cx": 1999.5, "cy": 1499.5, "k1": -0.05, "k2": 0.01, "p1": 5e-4, "p2": -3e-4, "k3": 0.0,
-}  # fmt: skip
 
 
 def cloud(points, order):
-    """Walls, each nearer one before a part of the farther ones, scanned in columns: (N, 3) camera frame, intensity."""
-    rng = np.random.default_rng(1)
-    rows = int(np.sqrt(points * 3 / 4))
-    x, y = np.meshgrid(np.linspace(-0.72, 0.72, points // rows), np.linspace(-0.54, 0.54, rows), indexing="ij")
-    x, y = x.ravel(), y.ravel()
-    depth = 8.0 + 6.0 * (np.floor(9 * (x + 0.72)).astype(int) % 4) + 0.2 * np.floor(20 * y)
-    depth += rng.normal(0, 0.002, len(depth))
-    xyz = np.stack([x * depth, y * depth, depth], axis=1)
-    intensity = rng.integers(0, 65535, len(xyz)).astype(np.float32)
-    if order == "shuffled":
-        mixed = rng.permutation(len(xyz))
-        xyz, intensity = xyz[mixed], intensity[mixed]
-    return np.ascontiguousarray(xyz), intensity
-
-
-def view():
-    from colourreg_rs import Camera, Pose, View
-
-    return View("v", None, Camera("OPENCV", WIDTH, HEIGHT, PARAMS), Pose(np.eye(3), np.zeros(3)))
-
-
-def project(xyz):
-    """In NumPy, as one writes it: pixels and depth."""
-    p = PARAMS
-    z = xyz[:, 2]
-    x, y = xyz[:, 0] / z, xyz[:, 1] / z
-    r2 = x * x + y * y
-    radial = 1 + r2 * (p["k1"] + r2 * p["k2"])
-    u = x * radial + 2 * p["p1"] * x * y + p["p2"] * (r2 + 2 * x * x)
-    v = y * radial + p["p1"] * (r2 + 2 * y * y) + 2 * p["p2"] * x * y
-    return p["fx"] * u + p["cx"], p["fy"] * v + p["cy"], z
+    """The building and what a scanner would have measured: (N, 3) camera frame, intensity (N,)."""
+    xyz = building.cloud(points, order, half=(0.72, 0.54))
+    return xyz, np.random.default_rng(2).integers(0, 65535, len(xyz)).astype(np.float32)
 
 
 def by_numpy(xyz, intensity, footprint):
-    u, v, z = project(xyz)
+    u, v, z = building.project(xyz, building.camera(WIDTH, HEIGHT))
     column, row = np.rint(u).astype(np.int64), np.rint(v).astype(np.int64)
     depth = np.full(WIDTH * HEIGHT, np.inf)
     reach = footprint // 2
@@ -82,8 +52,7 @@ def by_numpy(xyz, intensity, footprint):
 def by_colourreg(xyz, intensity, footprint):
     from colourreg_rs import _core
 
-    core = view().core
-    buffer = _core.IndexBuffer(core)
+    buffer = _core.IndexBuffer(building.view(WIDTH, HEIGHT))
     buffer.add(xyz)
     if footprint == 1:
         depth, index = buffer.images()
@@ -99,8 +68,7 @@ def by_colourreg(xyz, intensity, footprint):
 def numba_kernels():
     import numba
 
-    p = {k: float(v) for k, v in PARAMS.items()}
-    fx, fy, cx, cy, k1, k2, p1, p2 = (p[k] for k in ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"))
+    fx, fy, cx, cy, k1, k2, p1, p2, k3 = building.camera(WIDTH, HEIGHT).tolist()
 
     @numba.njit(parallel=True, fastmath=True)
     def draw(xyz, intensity, reach, depths, greys):
@@ -114,7 +82,7 @@ def numba_kernels():
                     continue
                 x, y = xyz[i, 0] / z, xyz[i, 1] / z
                 r2 = x * x + y * y
-                radial = 1 + r2 * (k1 + r2 * k2)
+                radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
                 c = int(np.rint(fx * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)) + cx))
                 r = int(np.rint(fy * (y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y) + cy))
                 for v in range(max(r - reach, 0), min(r + reach + 1, HEIGHT)):

@@ -91,10 +91,10 @@ fn colour_sigma(c: &mut Criterion) {
         group.bench_function(format!("tables, {} parameters", free.len()), |b| b.iter(|| new().exact_share()));
         let sigma = new();
         group.bench_function(format!("10 M points, no normals, {} parameters", free.len()), |b| {
-            b.iter(|| sigma.fill(&xyz, None, &mut out).unwrap());
+            b.iter(|| sigma.fill(&xyz, Slopes::default(), &mut out).unwrap());
         });
         group.bench_function(format!("10 M points, normals, {} parameters", free.len()), |b| {
-            b.iter(|| sigma.fill(&xyz, Some(&normals), &mut out).unwrap());
+            b.iter(|| sigma.fill(&xyz, Slopes::of(Some(&normals)), &mut out).unwrap());
         });
         group.bench_function(format!("rival: 0.1 M points by the formula, {} parameters", free.len()), |b| {
             b.iter(|| xyz[..100_000].iter().zip(&normals).map(|(p, n)| sigma.exact(p, Some(n))).sum::<f64>());
@@ -104,7 +104,7 @@ fn colour_sigma(c: &mut Criterion) {
     let covariance = adjusted(&view, 25, &FreeSet::pose(Model::OpenCv), &FullOptions::default()).covariance().unwrap();
     let sigma = SurfaceSigma::new(&view, &covariance, 0.3, ObjectNoise::Scanner(scanner)).unwrap();
     group.bench_function("10 M points, normals, scanner model", |b| {
-        b.iter(|| sigma.fill(&xyz, Some(&normals), &mut out).unwrap());
+        b.iter(|| sigma.fill(&xyz, Slopes::of(Some(&normals)), &mut out).unwrap());
     });
     group.finish();
 }

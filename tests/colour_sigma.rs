@@ -85,7 +85,7 @@ fn estimated(view: &View, free: &FreeSet, random: &mut Uniform) -> ViewCovarianc
 /// The fast figure of one point.
 fn at(sigma: &SurfaceSigma, p: &[f64; 3], normal: Option<&[f64; 3]>) -> f64 {
     let mut out = [0.0f32];
-    sigma.fill(std::slice::from_ref(p), normal.map(std::slice::from_ref), &mut out).unwrap();
+    sigma.fill(std::slice::from_ref(p), Slopes::of(normal.map(std::slice::from_ref)), &mut out).unwrap();
     f64::from(out[0])
 }
 
@@ -189,8 +189,8 @@ fn what_is_not_seen_has_no_figure_and_a_slanted_surface_a_larger_one() {
     assert!((at(&sigma, &front, Some(&[0.0; 3])) / none - 1.0).abs() < 1e-6);
     assert!(at(&sigma, &front, Some(&slanted)) > 1.5 * none);
     let mut out = vec![0.0f32; 3];
-    sigma.fill(&[front, behind, front], Some(&[facing, facing, slanted]), &mut out).unwrap();
+    sigma.fill(&[front, behind, front], Slopes::of(Some(&[facing, facing, slanted])), &mut out).unwrap();
     assert!(out[1].is_nan() && out[0] < out[2]);
-    assert!(sigma.fill(&[front], None, &mut out).is_err());
+    assert!(sigma.fill(&[front], Slopes::default(), &mut out).is_err());
     assert!(SurfaceSigma::new(&view, &covariance, -1.0, ObjectNoise::Isotropic(0.0)).is_err());
 }

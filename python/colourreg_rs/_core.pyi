@@ -337,6 +337,21 @@ class VisibilityMap:
     def limit(self) -> npt.NDArray[np.float32]:
         """The depth in each pixel (H, W) beyond which nothing is visible; infinite where nothing hides."""
 
+    def planes(self) -> LocalPlanes:
+        """The slopes of the surfaces that the photo sees."""
+
+class LocalPlanes:
+    """Local planes of the surfaces that a view sees, fitted to windows of the finished depth buffer: up to two in each
+    cell of a grid over (X, Y)/Z, told apart as in RANSAC (Fischler and Bolles 1981), from windows wide enough for the
+    depths' noise. Immutable."""
+
+    @property
+    def depth_noise(self) -> float:
+        """Sigma of a depth, in the cloud's unit, as the points scatter about their planes."""
+
+    def normals(self, xyz: FloatArray) -> FloatArray:
+        """Unit normals (N, 3), world frame, away from the camera, at points (N, 3); zeros where no plane passes."""
+
 Photo = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 
 def colour_points(
@@ -896,9 +911,12 @@ class SurfaceSigma:
     def exact_share(self) -> float:
         """The share of the photo's table cells in which the formula is evaluated instead of interpolated."""
 
-    def at(self, xyz: FloatArray, *, normals: FloatArray | None = None) -> npt.NDArray[np.float32]:
+    def at(
+        self, xyz: FloatArray, *, normals: FloatArray | None = None, planes: LocalPlanes | None = None
+    ) -> npt.NDArray[np.float32]:
         """One sigma per axis on the surface (N,), in the world's unit, √(trace / 2): within 0.4 % of the formula. NaN
-        outside the photo. Normals (N, 3) of any length; without one the surface is taken as facing the camera."""
+        outside the photo. Normals (N, 3) of any length; where there is none, or one without length, the slope is
+        that of the view's own ``planes``; without either the surface is taken as facing the camera."""
 
     def exact(self, xyz: FloatArray, normals: FloatArray | None = None) -> FloatArray:
         """The formula itself, slowly."""
@@ -911,6 +929,7 @@ class SurfaceSigma:
         out: npt.NDArray[np.float32],
         *,
         normals: FloatArray | None = None,
+        planes: LocalPlanes | None = None,
     ) -> None:
         """As :meth:`at`, into ``out`` (N,), only where ``source`` (N,) is ``number``; rounded to eight binary places
         (0.2 %), which pack well."""

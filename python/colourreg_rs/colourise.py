@@ -95,25 +95,26 @@ class ColouredChunk:
 
 
 class SigmaHistogram:
-    """The median of any number of sigmas in little memory: counts over a logarithmic scale, 2 % to the bin."""
+    """The median of any number of sigmas in little memory: ColourSigma is kept to eight binary places, so that the
+    numbers themselves can be counted."""
 
-    _EDGES = np.geomspace(1e-6, 1e3, 1048)
+    _DROPPED = 15
+    _BINS = int(np.float32(np.inf).view(np.uint32)) >> _DROPPED
 
     def __init__(self) -> None:
-        self._counts = np.zeros(len(self._EDGES) + 1, np.int64)
+        self._counts = np.zeros(self._BINS, np.int64)
 
     def add(self, sigma: npt.NDArray[np.float32]) -> None:
-        """Counts those that are known."""
-        known = sigma[np.isfinite(sigma)]
-        self._counts += np.bincount(np.searchsorted(self._EDGES, known), minlength=len(self._counts))
+        """Counts those that are known: not negative and finite."""
+        self._counts += np.bincount(sigma.view(np.uint32) >> self._DROPPED, minlength=self._BINS)[: self._BINS]
 
     def median(self) -> float | None:
-        """Metres, to 1 %; ``None`` where none was known."""
+        """Metres; ``None`` where none was known."""
         total = self._counts.sum()
         if total == 0:
             return None
-        i = int(np.searchsorted(np.cumsum(self._counts), total / 2))
-        return float(np.sqrt(self._EDGES[max(i - 1, 0)] * self._EDGES[min(i, len(self._EDGES) - 1)]))
+        i = np.searchsorted(np.cumsum(self._counts), total / 2)
+        return float(np.uint32(i << self._DROPPED).view(np.float32))
 
 
 class Colouriser:
@@ -131,6 +132,7 @@ class Colouriser:
         limits = {"max_distance": self.options.max_distance, "tolerance": self.options.tolerance}
         self._buffers = [_core.DepthBuffer(view.core, **limits) for view in self.views]
         self._maps: list[_core.VisibilityMap] = []
+        self._planes: list[_core.LocalPlanes | None] = []
         self._exposure = _core.Exposure(len(self.views)) if self.levels else None
         self._gains: FloatArray | None = None
         self._sigmas = [_surface_sigma(view, self.options) for view in self.views]
@@ -155,6 +157,10 @@ class Colouriser:
             raise InvalidInputError(f"{len(photos)} photos for {len(self.views)} views")
         self._maps = [buffer.finish() for buffer in self._buffers]
         self._buffers = []
+        # Slopes are asked for by ColourSigma alone.
+        self._planes = [
+            None if sigma is None else m.planes() for m, sigma in zip(self._maps, self._sigmas, strict=True)
+        ]
         self._photos = photos if isinstance(photos, PhotoShelf) else PhotoShelf.of(photos)
 
     def _photos_of(self, xyz: FloatArray) -> list[npt.NDArray[Any]]:
@@ -166,18 +172,25 @@ class Colouriser:
         assert self._exposure is not None
         self._exposure.add(self._maps, self._photos_of(xyz), xyz)
 
-    def colour(self, xyz: FloatArray) -> ColouredChunk:
-        """Second pass. Points that no photo sees have source 0 and an undefined colour."""
+    def colour(self, xyz: FloatArray, normals: FloatArray | None = None) -> ColouredChunk:
+        """Second pass. Points that no photo sees have source 0 and an undefined colour.
+
+        Args:
+            xyz: (N, 3) points.
+            normals: (N, 3) the surface's normals, of any length, where the cloud knows them; zeros where it does not.
+                Else slopes come from the depth buffers.
+        """
         if self._exposure is not None and self._gains is None:
             self._gains = self._exposure.gains()
         options = self.options
         rgb, source = _core.colour_points(
-            self._maps, self._photos_of(xyz), xyz, sampling=options.sampling, blend=options.blend, gains=self._gains
-        )
+            self._maps, self._photos_of(xyz), xyz, sampling=options.sampling, blend=options.blend, gains=self._gains,
+            normals=normals,
+        )  # fmt: skip
         sigma = np.full(len(xyz), np.nan, np.float32)
-        for number, surface in enumerate(self._sigmas, 1):
+        for number, (surface, planes) in enumerate(zip(self._sigmas, self._planes, strict=True), 1):
             if surface is not None:
-                surface.fill_where(xyz, source, number, sigma)
+                surface.fill_where(xyz, source, number, sigma, normals=normals, planes=planes)
         if options.max_sigma is not None:
             unsure = sigma > options.max_sigma  # not where it is unknown: NaN compares false
             source[unsure], sigma[unsure] = 0, np.nan
@@ -296,6 +309,14 @@ def _first_pass(
     return low, high
 
 
+def _normals(chunk: CloudChunk) -> FloatArray | None:
+    """The cloud's own, zeros where they are none."""
+    if chunk.normals is None:
+        return None
+    normals = np.ascontiguousarray(chunk.normals, np.float64)
+    return np.where(np.isfinite(normals).all(axis=1, keepdims=True), normals, 0.0)
+
+
 def _second_pass(
     reader: CloudReader, writer: CloudWriter, colouriser: Colouriser, progress: Progress
 ) -> tuple[int, npt.NDArray[np.int64], float | None]:
@@ -311,7 +332,7 @@ def _second_pass(
 
     with Behind(write) as writing:
         for chunk in prefetched(reader.chunks(colouriser.options.chunk_size)):
-            new = colouriser.colour(chunk.xyz)
+            new = colouriser.colour(chunk.xyz, _normals(chunk))
             counts += np.bincount(new.source, minlength=len(counts))
             sigmas.add(new.sigma)
             writing.put((chunk, new))

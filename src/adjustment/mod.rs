@@ -28,7 +28,7 @@ pub use error_map::{PredictedError, at_depth, photo_grid, predicted_errors};
 pub use full::{Adjusted, FullOptions, PointOutcome, adjust_fully};
 pub use gauss_helmert::{Conditions, Constraints, Design, Linearised, Observed, PointFit, Priors, Solution, adjust};
 pub use next_point::{Advice, Candidate, Criterion, NextPoints, next_points};
-pub use propagation::{ObjectNoise, SurfaceSigma};
+pub use propagation::{ObjectNoise, Slopes, SurfaceSigma};
 pub use reliability::{GroupRedundancy, PointReliability, PointTest, TestLevels, reliability};
 pub use scanner::ScannerModel;
 pub use similarity_conditions::{SimilarityAdjustment, SimilarityConditions, adjust_similarity};

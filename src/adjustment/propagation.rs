@@ -18,11 +18,12 @@ use rayon::prelude::*;
 
 use super::error_map::across_the_ray;
 use super::scanner::ScannerModel;
-use super::sigma_blocks::{BLOCK, fill_block};
+use super::sigma_blocks::{BLOCK, fill_block, is_direction};
 use super::sigma_tables::{Cell, Face, make_faces};
 use super::view_covariance::ViewCovariance;
 use crate::error::{Error, Result};
-use crate::geometry::View;
+use crate::geometry::{Pose, View};
+use crate::render::LocalPlanes;
 
 /// At a more grazing angle than this cosine the figure stays as it is.
 pub(super) const MIN_COSINE: f64 = 1e-3;
@@ -36,6 +37,37 @@ pub enum ObjectNoise {
     Isotropic(f64),
     /// Range and angles of a scanner.
     Scanner(ScannerModel),
+}
+
+/// What is known of the surfaces' slopes. A point's own normal counts before the plane at its place; where there is neither
+/// the surface is taken as facing the camera.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Slopes<'a> {
+    /// One for each point, world frame, of any length; without length for none.
+    pub normals: Option<&'a [[f64; 3]]>,
+    /// What the view's depth buffer says.
+    pub planes: Option<&'a LocalPlanes>,
+}
+
+impl<'a> Slopes<'a> {
+    /// With the points' own normals alone.
+    pub fn of(normals: Option<&'a [[f64; 3]]>) -> Self {
+        Self { normals, planes: None }
+    }
+
+    /// The normal at the point of this number, in the world frame.
+    pub(super) fn normal(&self, pose: &Pose, i: usize, xyz: &[f64; 3]) -> Option<[f64; 3]> {
+        let own = self.normals.map(|normals| normals[i]).filter(|n| is_direction(n.map(|x| x as f32)));
+        own.or_else(|| {
+            let q = pose.transform(xyz).map(|x| x as f32);
+            let n = self.planes?.normal(q.into())?;
+            Some((pose.rotation.transpose() * Vector3::from(n.map(f64::from))).into())
+        })
+    }
+
+    fn fits(&self, n: usize) -> bool {
+        self.normals.is_none_or(|normals| normals.len() == n)
+    }
 }
 
 /// The colour position error over a cloud, for one view.
@@ -103,12 +135,12 @@ impl SurfaceSigma {
     }
 
     /// One sigma per axis on the surface for every point, in parallel, into the caller's array; NaN outside the photo.
-    pub fn fill(&self, xyz: &[[f64; 3]], normals: Option<&[[f64; 3]]>, out: &mut [f32]) -> Result<()> {
-        if out.len() != xyz.len() || normals.is_some_and(|n| n.len() != xyz.len()) {
+    pub fn fill(&self, xyz: &[[f64; 3]], slopes: Slopes<'_>, out: &mut [f32]) -> Result<()> {
+        if out.len() != xyz.len() || !slopes.fits(xyz.len()) {
             return Err(Error::invalid(format!(
                 "{} points with {} normals and room for {} sigmas",
                 xyz.len(),
-                normals.map_or(0, <[_]>::len),
+                slopes.normals.map_or(0, <[_]>::len),
                 out.len()
             )));
         }
@@ -118,7 +150,8 @@ impl SurfaceSigma {
             for out in out.chunks_mut(BLOCK) {
                 let here = first..first + out.len();
                 first = here.end;
-                fill_block(self, faces, &xyz[here.clone()], normals.map(|n| &n[here]), out);
+                let normals = slopes.normals.map(|n| &n[here.clone()]);
+                fill_block(self, faces, &xyz[here], Slopes { normals, ..slopes }, out);
             }
         });
         Ok(())
@@ -129,17 +162,17 @@ impl SurfaceSigma {
     pub fn fill_where(
         &self,
         xyz: &[[f64; 3]],
-        normals: Option<&[[f64; 3]]>,
+        slopes: Slopes<'_>,
         source: &[u16],
         number: u16,
         out: &mut [f32],
     ) -> Result<()> {
-        if source.len() != xyz.len() || out.len() != xyz.len() || normals.is_some_and(|n| n.len() != xyz.len()) {
+        if source.len() != xyz.len() || out.len() != xyz.len() || !slopes.fits(xyz.len()) {
             return Err(Error::invalid(format!(
                 "{} points with {} sources, {} normals and room for {} sigmas",
                 xyz.len(),
                 source.len(),
-                normals.map_or(0, <[_]>::len),
+                slopes.normals.map_or(0, <[_]>::len),
                 out.len()
             )));
         }
@@ -154,14 +187,15 @@ impl SurfaceSigma {
                 while n < BLOCK && at < out.len() {
                     if source[first + at] == number {
                         (mine[n], points[n]) = (at, xyz[first + at]);
-                        if let Some(normals) = normals {
+                        if let Some(normals) = slopes.normals {
                             turned[n] = normals[first + at];
                         }
                         n += 1;
                     }
                     at += 1;
                 }
-                fill_block(self, faces, &points[..n], normals.map(|_| &turned[..n]), &mut found[..n]);
+                let normals = slopes.normals.map(|_| &turned[..n]);
+                fill_block(self, faces, &points[..n], Slopes { normals, ..slopes }, &mut found[..n]);
                 for (place, value) in mine[..n].iter().zip(&found) {
                     out[*place] = stored(*value);
                 }

@@ -1,7 +1,7 @@
 //! The colour position error of a block of points: rays for all, then the tables, then the surfaces, each step in loops
 //! that the compiler turns into vector instructions. Single precision suffices behind the difference to the centre.
 
-use super::propagation::{MIN_COSINE, ObjectNoise, SurfaceSigma};
+use super::propagation::{MIN_COSINE, ObjectNoise, Slopes, SurfaceSigma};
 use super::sigma_tables::{Cell, Face, Node, weights};
 
 /// Points per block: all steps' arrays stay in the innermost cache.
@@ -20,42 +20,24 @@ struct Station {
 }
 
 /// One sigma per axis on the surface for up to [`BLOCK`] points.
-pub(super) fn fill_block(
-    sigma: &SurfaceSigma,
-    faces: &[Face],
-    xyz: &[[f64; 3]],
-    normals: Option<&[[f64; 3]]>,
-    out: &mut [f32],
-) {
+pub(super) fn fill_block(sigma: &SurfaceSigma, faces: &[Face], xyz: &[[f64; 3]], slopes: Slopes<'_>, out: &mut [f32]) {
     #[cfg(target_arch = "x86_64")]
     if std::arch::is_x86_feature_detected!("avx2") {
         // SAFETY: the processor has the instructions that the function is compiled for.
-        unsafe { fill_block_avx2(sigma, faces, xyz, normals, out) };
+        unsafe { fill_block_avx2(sigma, faces, xyz, slopes, out) };
         return;
     }
-    fill_block_anywhere(sigma, faces, xyz, normals, out);
+    fill_block_anywhere(sigma, faces, xyz, slopes, out);
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
-fn fill_block_avx2(
-    sigma: &SurfaceSigma,
-    faces: &[Face],
-    xyz: &[[f64; 3]],
-    normals: Option<&[[f64; 3]]>,
-    out: &mut [f32],
-) {
-    fill_block_anywhere(sigma, faces, xyz, normals, out);
+fn fill_block_avx2(sigma: &SurfaceSigma, faces: &[Face], xyz: &[[f64; 3]], slopes: Slopes<'_>, out: &mut [f32]) {
+    fill_block_anywhere(sigma, faces, xyz, slopes, out);
 }
 
 #[inline(always)]
-fn fill_block_anywhere(
-    sigma: &SurfaceSigma,
-    faces: &[Face],
-    xyz: &[[f64; 3]],
-    normals: Option<&[[f64; 3]]>,
-    out: &mut [f32],
-) {
+fn fill_block_anywhere(sigma: &SurfaceSigma, faces: &[Face], xyz: &[[f64; 3]], slopes: Slopes<'_>, out: &mut [f32]) {
     let n = xyz.len().min(out.len()).min(BLOCK);
     let pose = &sigma.view.pose;
     let rotation: [[f32; 3]; 3] = std::array::from_fn(|i| std::array::from_fn(|k| pose.rotation[(i, k)] as f32));
@@ -73,11 +55,22 @@ fn fill_block_anywhere(
         }
     }
     let mut normal: [Lane; 3] = [[0.0; BLOCK]; 3];
-    if let Some(normals) = normals {
+    if let Some(normals) = slopes.normals {
         for (i, p) in normals[..n].iter().enumerate() {
             let q = turn(p.map(|x| x as f32));
             for a in 0..3 {
                 normal[a][i] = q[a];
+            }
+        }
+    }
+    if let Some(planes) = slopes.planes {
+        for i in 0..n {
+            if !is_direction([normal[0][i], normal[1][i], normal[2][i]])
+                && let Some(found) = planes.normal([ray[0][i], ray[1][i], ray[2][i]])
+            {
+                for a in 0..3 {
+                    normal[a][i] = found[a];
+                }
             }
         }
     }
@@ -218,8 +211,15 @@ fn fill_block_anywhere(
     }
     out[..n].copy_from_slice(&variance[..n]);
     for i in to_do[..open].iter().map(|i| usize::from(*i)) {
-        out[i] = sigma.exact(&xyz[i], normals.map(|n| &n[i])) as f32;
+        out[i] = sigma.exact(&xyz[i], slopes.normal(pose, i, &xyz[i]).as_ref()) as f32;
     }
+}
+
+/// Whether these are the components of a normal: some have none.
+#[inline(always)]
+pub(super) fn is_direction(n: [f32; 3]) -> bool {
+    let square = dot(&n, &n);
+    square > 0.0 && square < f32::MAX
 }
 
 /// Where the rays meet their tables.

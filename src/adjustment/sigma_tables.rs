@@ -14,7 +14,7 @@ use rayon::prelude::*;
 
 use super::view_covariance::ViewCovariance;
 use crate::estimation::{MAX_FREE, Parameter};
-use crate::geometry::{Depth, View};
+use crate::geometry::{Depth, View, forward_field};
 
 /// The largest relative difference of a sigma from the exact formula's at the places where a cell is compared.
 pub const TOLERANCE: f64 = 2e-3;
@@ -149,7 +149,7 @@ pub(super) fn make_faces(view: &View, covariance: &ViewCovariance, image_varianc
     };
     match view.camera.depth_kind() {
         Depth::AlongAxis => {
-            let (low, high) = field(view);
+            let (low, high) = forward_field(view);
             vec![make([0, 1, 2], 1.0, low, high)]
         }
         Depth::Range => (0..6)
@@ -159,34 +159,6 @@ pub(super) fn make_faces(view: &View, covariance: &ViewCovariance, image_varianc
             })
             .collect(),
     }
-}
-
-/// The photo's border in (u, v), with a margin.
-fn field(view: &View) -> ([f64; 2], [f64; 2]) {
-    let (width, height) = (f64::from(view.camera.width), f64::from(view.camera.height));
-    let (mut low, mut high) = ([f64::INFINITY; 2], [f64::NEG_INFINITY; 2]);
-    let n = 64;
-    for i in 0..=n {
-        let t = f64::from(i) / f64::from(n);
-        let (x, y) = (t * width - 0.5, t * height - 0.5);
-        for pixel in [[x, -0.5], [x, height - 0.5], [-0.5, y], [width - 0.5, y], [x, 0.5 * height]] {
-            let Some(d) = view.camera.unproject(&pixel).filter(|d| d.z > 0.0) else { continue };
-            for (axis, value) in [d.x / d.z, d.y / d.z].into_iter().enumerate() {
-                low[axis] = low[axis].min(value);
-                high[axis] = high[axis].max(value);
-            }
-        }
-    }
-    // Where the photo reaches beyond the lens's field, the field's edge is the border.
-    let edge = view.camera.max_angle().tan().clamp(0.0, 1e3);
-    for axis in 0..2 {
-        if low[axis] >= high[axis] {
-            (low[axis], high[axis]) = (-edge, edge);
-        }
-        let margin = 0.02 * (high[axis] - low[axis]);
-        (low[axis], high[axis]) = (low[axis] - margin, high[axis] + margin);
-    }
-    (low, high)
 }
 
 /// What one face is made from.

@@ -5,7 +5,7 @@ use rayon::prelude::*;
 
 use crate::error::{Error, Result};
 use crate::geometry::{Block, BlockProjector, Depth, Frustum, LANES, Model, View};
-use crate::render::{DepthBuffer, Footprint, Located, Sample, Surfaces, clamped};
+use crate::render::{DepthBuffer, Footprint, LocalPlanes, Located, Sample, Surfaces, clamped};
 
 /// Points per task of the scheduler.
 const TASK: usize = 16 * LANES;
@@ -85,6 +85,11 @@ impl VisibilityMap {
     /// Whether the photo is a panorama, whose left and right border are the same place.
     pub fn wraps(&self) -> bool {
         self.surfaces.grid.wraps
+    }
+
+    /// The slopes of the surfaces that the photo sees.
+    pub fn planes(&self) -> LocalPlanes {
+        LocalPlanes::new(&self.view, self.surfaces.grid, &self.surfaces.samples)
     }
 
     /// The nearest depth in each pixel of the photo, row by row; NaN where there is no point.

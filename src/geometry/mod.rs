@@ -2,6 +2,7 @@
 
 mod block;
 mod camera;
+mod field;
 mod fisheye;
 mod frustum;
 mod polynomial;
@@ -13,6 +14,7 @@ mod view;
 
 pub use block::{Block, BlockProjector, LANES};
 pub use camera::{Camera, Depth, MAX_PARAMS, Model, Projection};
+pub use field::forward_field;
 pub use frustum::Frustum;
 pub use pose::{Pose, rotation_exp, rotation_log, skew_matrix};
 pub use project::{ViewJacobian, project, project_into, unproject};

@@ -8,6 +8,7 @@ use super::arrays::{Input, Output, owned, owned_rows, points3};
 use super::geometry::PyView;
 use crate::colour::{Blend, Colourist, Colours, Exposure, Interpolation, Photo, Pixels, VisibilityMap};
 use crate::error::Error;
+use crate::render::LocalPlanes;
 
 #[pyclass(frozen, name = "VisibilityMap", module = "colourreg_rs._core")]
 pub(super) struct PyVisibilityMap(pub VisibilityMap);
@@ -25,12 +26,33 @@ impl PyVisibilityMap {
         Ok(PyArray1::from_vec(py, py.detach(|| self.0.visible(points))))
     }
 
+    fn planes(&self, py: Python<'_>) -> PyLocalPlanes {
+        PyLocalPlanes(py.detach(|| self.0.planes()))
+    }
+
     fn depth<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f32>>> {
         self.image(py, VisibilityMap::depth)
     }
 
     fn limit<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f32>>> {
         self.image(py, VisibilityMap::limit)
+    }
+}
+
+#[pyclass(frozen, name = "LocalPlanes", module = "colourreg_rs._core")]
+pub(super) struct PyLocalPlanes(pub LocalPlanes);
+
+#[pymethods]
+impl PyLocalPlanes {
+    #[getter]
+    fn depth_noise(&self) -> f32 {
+        self.0.depth_noise()
+    }
+
+    fn normals<'py>(&self, py: Python<'py>, xyz: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyArray2<f64>>> {
+        let input = points3(xyz, "xyz")?;
+        let points = input.rows::<3>()?;
+        owned_rows(py, py.detach(|| self.0.normals(points)))
     }
 }
 
@@ -168,6 +190,7 @@ impl PyExposure {
 
 pub(super) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_class::<PyVisibilityMap>()?;
+    m.add_class::<PyLocalPlanes>()?;
     m.add_class::<PyExposure>()?;
     m.add_function(wrap_pyfunction!(colour_points, m)?)
 }

@@ -7,9 +7,10 @@ use pyo3::types::PyDict;
 
 use super::adjustment::view_covariance;
 use super::arrays::{Input, Output, owned, owned_rows, points2, points3};
+use super::colour::PyLocalPlanes;
 use super::geometry::PyView;
 use crate::adjustment::{
-    Candidate, Criterion, ObjectNoise, RootMeanSquare, ScannerModel, SurfaceSigma, check_points, next_points,
+    Candidate, Criterion, ObjectNoise, RootMeanSquare, ScannerModel, Slopes, SurfaceSigma, check_points, next_points,
     photo_grid, predicted_errors,
 };
 use crate::error::Error;
@@ -191,19 +192,21 @@ impl PySurfaceSigma {
         self.0.exact_share()
     }
 
-    #[pyo3(signature = (xyz, *, normals=None))]
+    #[pyo3(signature = (xyz, *, normals=None, planes=None))]
     fn at<'py>(
         &self,
         py: Python<'py>,
         xyz: &Bound<'py, PyAny>,
         normals: Option<&Bound<'py, PyAny>>,
+        planes: Option<PyRef<'py, PyLocalPlanes>>,
     ) -> PyResult<Bound<'py, PyArray1<f32>>> {
         let input = points3(xyz, "xyz")?;
         let points = input.rows::<3>()?;
         let normals = normals.map(|n| Input::<f64>::new(n, "normals", &[Some(points.len()), Some(3)])).transpose()?;
         let normals = normals.as_ref().map(Input::rows::<3>).transpose()?;
         let mut out = vec![0.0f32; points.len()];
-        py.detach(|| self.0.fill(points, normals, &mut out))?;
+        let slopes = Slopes { normals, planes: planes.as_ref().map(|p| &p.0) };
+        py.detach(|| self.0.fill(points, slopes, &mut out))?;
         Ok(PyArray1::from_vec(py, out))
     }
 
@@ -221,7 +224,8 @@ impl PySurfaceSigma {
         Ok(PyArray1::from_vec(py, py.detach(|| (0..points.len()).map(one).collect())))
     }
 
-    #[pyo3(signature = (xyz, source, number, out, *, normals=None))]
+    #[pyo3(signature = (xyz, source, number, out, *, normals=None, planes=None))]
+    #[allow(clippy::too_many_arguments, reason = "keywords in Python")]
     fn fill_where<'py>(
         &self,
         py: Python<'py>,
@@ -230,6 +234,7 @@ impl PySurfaceSigma {
         number: u16,
         out: &Bound<'py, PyAny>,
         normals: Option<&Bound<'py, PyAny>>,
+        planes: Option<PyRef<'py, PyLocalPlanes>>,
     ) -> PyResult<()> {
         let input = points3(xyz, "xyz")?;
         let points = input.rows::<3>()?;
@@ -239,7 +244,8 @@ impl PySurfaceSigma {
         let normals = normals.as_ref().map(Input::rows::<3>).transpose()?;
         let mut out = Output::<f32>::new(out, "out", &[n])?;
         let (source, out) = (source.values()?, out.values()?);
-        Ok(py.detach(|| self.0.fill_where(points, normals, source, number, out))?)
+        let slopes = Slopes { normals, planes: planes.as_ref().map(|p| &p.0) };
+        Ok(py.detach(|| self.0.fill_where(points, slopes, source, number, out))?)
     }
 }
 

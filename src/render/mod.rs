@@ -6,6 +6,8 @@ pub mod filling;
 mod footprint;
 pub mod intensity;
 mod links;
+mod plane_fit;
+mod planes;
 mod pyramid;
 pub mod resampling;
 mod sample;
@@ -14,6 +16,7 @@ mod zbuffer;
 
 pub(crate) use footprint::pixel_angle;
 pub use footprint::{Footprint, Surfaces};
+pub use planes::LocalPlanes;
 pub use sample::Sample;
 pub(crate) use sample::clamped;
 pub(crate) use zbuffer::fetch;

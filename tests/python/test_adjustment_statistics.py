@@ -12,7 +12,7 @@ import pytest
 from adjustment_cases import CALIBRATION, Case, case, covariances, dlt_case, errors_of, squared_distance
 from scipy import stats
 
-from colourreg_rs import Camera, View, _core
+from colourreg_rs import Camera, Pose, View, _core
 
 pytestmark = pytest.mark.slow
 
@@ -247,6 +247,68 @@ def test_colour_sigma_holds_39_86_and_99_percent_of_the_errors(setup, rng):
     # lie inside one sigma and a few more outside three.
     assert (slanted**2).mean() / 2 == pytest.approx(1.0, abs=0.05)
     assert 0.38 < (slanted < 1).mean() < 0.53 and 0.84 < (slanted < 2).mean() < 0.88 and (slanted < 3).mean() > 0.965
+
+
+def inside(limit: float, ratio: np.ndarray) -> np.ndarray:
+    """The part of a normal distribution within a circle of ``limit`` times √(trace / 2), for this ratio of its axes."""
+    turn = np.linspace(0, np.pi / 2, 721)
+    # In polar coordinates of the whitened plane the radius integrates by itself.
+    radius2 = limit**2 * (1 + ratio[:, None] ** 2) / 2 / (np.cos(turn) ** 2 + ratio[:, None] ** 2 * np.sin(turn) ** 2)
+    return 1 - np.trapezoid(np.exp(-0.5 * radius2), turn, axis=1) / (np.pi / 2)
+
+
+def test_colour_sigma_holds_the_errors_on_slanted_surfaces(rng):
+    # The whole way of a cloud: slopes come from the noisy points in the depth buffer of the estimated view.
+    camera = Camera("OPENCV", 900, 700, {"fx": 700.0, "fy": 700.0, "cx": 452.0, "cy": 347.0, "k1": -0.06, "k2": 0.02})
+    view = View("street", None, camera, Pose.looking_at([0, 0, 1.6], [1.0, 10, 1.4]))
+    problem = case(20, rng, view=view)
+    # A floor, a façade along the street, one across, and a ramp, seen by a scanner beside the camera.
+    surfaces = (((0, 0, 1), 0), ((1, 0.1, 0), -3), ((0.1, 1, 0), 14), ((0.1, -0.3, 1), -1.5))
+    planes = [(np.array(n) / np.linalg.norm(n), c / np.linalg.norm(n)) for n, c in surfaces]
+    pixels = np.stack(np.meshgrid(np.arange(-20, 920, 0.7), np.arange(-20, 720, 0.7)), -1).reshape(-1, 2)
+    rays = _core.unproject(view.core, np.ascontiguousarray(pixels))
+    rays = rays[np.isfinite(rays).all(1)]
+    station = np.array([0.2, -0.1, 1.7])
+    reach = np.stack([(c - station @ n) / (rays @ n) for n, c in planes], 1)
+    reach[reach <= 0] = np.inf
+    nearest = reach.argmin(1)
+    exact = station + rays * reach.min(1)[:, None]
+    normals = np.array([n for n, _ in planes])[nearest]
+    sigma_image, sigma_xyz, trials, taken = 0.5, 0.002, 100, 3000
+    errors, slants, ratios = [], [], []
+    for _ in range(trials):
+        result = problem.adjust(*problem.noisy(rng), ["pose"], **KNOWN)
+        noisy = exact + sigma_xyz * rng.standard_normal(exact.shape)
+        buffer = _core.DepthBuffer(result.view)
+        buffer.add(noisy)
+        seen_by = buffer.finish()
+        some = np.sort(rng.choice(len(exact), taken, replace=False))
+        some = some[seen_by.visible(noisy[some])]
+        sigma = _core.SurfaceSigma(
+            result.view, result.names, result.covariance, sigma_image=sigma_image, sigma_xyz=sigma_xyz
+        )
+        stated = sigma.at(noisy[some], planes=seen_by.planes()).astype(float)
+        place, normal = exact[some], normals[some]
+        pixel = _core.project(result.view, noisy[some])[0] + sigma_image * rng.standard_normal((len(some), 2))
+        seen = _core.unproject(view.core, np.ascontiguousarray(pixel))
+        arm = place - view.core.centre
+        error = seen * ((arm * normal).sum(1) / (seen * normal).sum(1))[:, None] - arm
+        cosine = np.abs((arm * normal).sum(1)) / np.linalg.norm(arm, axis=1)
+        errors.append(np.linalg.norm(error, axis=1) / stated)
+        slants.append(np.degrees(np.arccos(cosine)))
+        ratios.append(cosine)
+    error, slant, ratio = (np.concatenate(part) for part in (errors, slants, ratios))
+    for low, high in ((0, 45), (45, 60), (60, 70), (70, 78), (78, 84)):
+        here = (slant >= low) & (slant < high)
+        assert here.sum() > 3_000
+        # Nearer to grazing, one point in a hundred, at the foot of a wall, takes the wall's slope for its own.
+        square = (error[here] ** 2).mean() / 2
+        assert square == pytest.approx(1.0, abs=0.07 if high < 80 else 0.2), (low, square)
+        # The axes' ratio is about the cosine: a long ellipse has more within one sigma, and less within three.
+        for limit in (1, 2, 3):
+            expected = inside(limit, ratio[here]).mean()
+            found = (error[here] < limit).mean()
+            assert abs(found - expected) < 0.02, (low, limit, found, expected)
 
 
 def test_colour_sigma_from_the_tables_is_as_honest(rng):

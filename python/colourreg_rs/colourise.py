@@ -80,18 +80,14 @@ class ColouriseResult:
 
 @dataclass(frozen=True)
 class ColouredChunk:
-    """Colours (N, 3), the number of their view from 1 or 0 (N,), and the sigma of their place in metres (N,)."""
+    """Colours (N, 3), the number of their view from 1 or 0 (N,), and the sigma of their place in metres (N,).
+
+    Points of view 0 have the colour that they had before, or black.
+    """
 
     rgb: npt.NDArray[np.uint16]
     source: npt.NDArray[np.uint16]
     sigma: npt.NDArray[np.float32]
-
-    def over(self, before: npt.NDArray[np.uint16] | None) -> npt.NDArray[np.uint16]:
-        """The colours, with those from before, or black, where no photo saw the point."""
-        unseen = self.source == 0
-        if unseen.any():
-            self.rgb[unseen] = 0 if before is None else before[unseen]
-        return self.rgb
 
 
 class SigmaHistogram:
@@ -172,20 +168,29 @@ class Colouriser:
         assert self._exposure is not None
         self._exposure.add(self._maps, self._photos_of(xyz), xyz)
 
-    def colour(self, xyz: FloatArray, normals: FloatArray | None = None) -> ColouredChunk:
-        """Second pass. Points that no photo sees have source 0 and an undefined colour.
+    def colour(
+        self,
+        xyz: FloatArray,
+        normals: FloatArray | None = None,
+        before: npt.NDArray[np.uint16] | None = None,
+    ) -> ColouredChunk:
+        """Second pass. Points that no photo sees have source 0.
 
         Args:
             xyz: (N, 3) points.
             normals: (N, 3) the surface's normals, of any length, where the cloud knows them; zeros where it does not.
                 Else slopes come from the depth buffers.
+            before: (N, 3) the colours that unseen points keep; without them these are black.
         """
         if self._exposure is not None and self._gains is None:
             self._gains = self._exposure.gains()
         options = self.options
-        rgb, source = _core.colour_points(
+        rgb = np.zeros((len(xyz), 3), np.uint16) if before is None else np.array(before, np.uint16, order="C")
+        source = np.empty(len(xyz), np.uint16)
+        # The core writes over the points that it sees.
+        _core.colour_points(
             self._maps, self._photos_of(xyz), xyz, sampling=options.sampling, blend=options.blend, gains=self._gains,
-            normals=normals,
+            normals=normals, out_rgb=rgb, out_source=source,
         )  # fmt: skip
         sigma = np.full(len(xyz), np.nan, np.float32)
         for number, (surface, planes) in enumerate(zip(self._sigmas, self._planes, strict=True), 1):
@@ -194,6 +199,7 @@ class Colouriser:
         if options.max_sigma is not None:
             unsure = sigma > options.max_sigma  # not where it is unknown: NaN compares false
             source[unsure], sigma[unsure] = 0, np.nan
+            rgb[unsure] = 0 if before is None else before[unsure]
         return ColouredChunk(rgb, source, sigma)
 
 
@@ -257,13 +263,13 @@ def colourise_file(
             photos = PhotoShelf([partial(_pixels, view) for view in views], _sizes(views), options.photo_memory)
             filled = decoder.submit(photos.fill)
             try:
-                low, high = _first_pass(reader, colouriser, photos, filled, progress)
+                _first_pass(reader, colouriser, photos, filled, progress)
             except BaseException:
                 decoder.shutdown(wait=False, cancel_futures=True)
                 raise
         coloured, counts, sigmas = _second_pass(reader, writer, colouriser, progress)
         if coloured == 0:
-            raise FileError(cloud, _nothing_seen(views, low, high), "check the registration's frame and unit")
+            raise FileError(cloud, _nothing_seen(views, reader), "check the registration's frame and unit")
     return ColouriseResult(
         out=out,
         points=reader.n_points,
@@ -280,8 +286,9 @@ def _doubts(views: Sequence[View]) -> tuple[str, ...]:
     return tuple(f"view {name} was registered with a doubt: {doubt}" for name, doubt in said)
 
 
-def _nothing_seen(views: Sequence[View], low: FloatArray, high: FloatArray) -> str:
-    extent = "x ".join(f"{a:.1f}…{b:.1f} " for a, b in zip(low, high, strict=True))
+def _nothing_seen(views: Sequence[View], reader: CloudReader) -> str:
+    box = reader.told_extent() or reader.extent()
+    extent = "x ".join(f"{a:.1f}…{b:.1f} " for a, b in zip(box.low, box.high, strict=True))
     place = ", ".join(f"{v:.1f}" for v in views[0].core.centre)
     return f"none of its points lies in any photo; it spans {extent}, view {views[0].name!r} stands at {place}"
 
@@ -292,13 +299,11 @@ def _positions(reader: CloudReader, options: ColouriseOptions) -> Iterator[Cloud
 
 def _first_pass(
     reader: CloudReader, colouriser: Colouriser, photos: PhotoShelf, filled: Future[None], progress: Progress
-) -> tuple[FloatArray, FloatArray]:
-    """Fills and finishes the buffers; gives the cloud's extent."""
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+) -> None:
+    """Fills and finishes the buffers."""
     total = reader.n_points
     for chunk in _positions(reader, colouriser.options):
         colouriser.see(chunk.xyz)
-        low, high = np.fmin(low, np.fmin.reduce(chunk.xyz)), np.fmax(high, np.fmax.reduce(chunk.xyz))
         progress("finding what hides what", chunk.start + len(chunk), total)
     colouriser.finish(photos)
     filled.result()
@@ -306,14 +311,14 @@ def _first_pass(
         for chunk in _positions(reader, colouriser.options):
             colouriser.compare(chunk.xyz)
             progress("levelling exposures", chunk.start + len(chunk), total)
-    return low, high
 
 
 def _normals(chunk: CloudChunk) -> FloatArray | None:
     """The cloud's own, zeros where they are none."""
-    if chunk.normals is None:
+    found = chunk.normals
+    if found is None:
         return None
-    normals = np.ascontiguousarray(chunk.normals, np.float64)
+    normals = np.ascontiguousarray(found, np.float64)
     return np.where(np.isfinite(normals).all(axis=1, keepdims=True), normals, 0.0)
 
 
@@ -327,12 +332,12 @@ def _second_pass(
 
     def write(item: tuple[CloudChunk, ColouredChunk]) -> None:
         chunk, new = item
-        writer.write(chunk, rgb=new.over(chunk.rgb), source=new.source, sigma=new.sigma)
+        writer.write(chunk, rgb=new.rgb, source=new.source, sigma=new.sigma)
         progress("colouring", chunk.start + len(chunk), total)
 
     with Behind(write) as writing:
         for chunk in prefetched(reader.chunks(colouriser.options.chunk_size)):
-            new = colouriser.colour(chunk.xyz, _normals(chunk))
+            new = colouriser.colour(chunk.xyz, _normals(chunk), chunk.rgb)
             counts += np.bincount(new.source, minlength=len(counts))
             sigmas.add(new.sigma)
             writing.put((chunk, new))

@@ -11,7 +11,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from colourreg_rs import Camera, ColouriseOptions, Colouriser, PointCloud, Pose, Registration, View, write_registration
+from colourreg_rs import (
+    Camera,
+    ColouriseOptions,
+    Colouriser,
+    Covariance,
+    PointCloud,
+    Pose,
+    Registration,
+    View,
+    write_registration,
+)
 from colourreg_rs.io.clouds import write_cloud
 from colourreg_rs.io.images import write_image
 from colourreg_rs.photos import PhotoShelf
@@ -104,3 +114,31 @@ def test_memory_is_that_of_the_photos_in_use(tmp_path, rng):
     assert most - few > 0.7 * (count - 6) * photo, peaks
     a, b = (Path(tmp_path / f"out-{limit}.las").read_bytes() for limit in peaks)
     assert a == b
+
+
+def test_unseen_points_keep_what_they_had_and_nobody_s_array_is_written_into(rng):
+    (view, *_) = ring(4, (120, 90))
+    xyz = panorama(4_000)
+    photo = rng.integers(1, 256, (90, 120, 3), dtype=np.uint8)
+    before = rng.integers(0, 65536, (len(xyz), 3), dtype=np.uint16)
+    kept = before.copy()
+    colouriser = Colouriser([view], ColouriseOptions())
+    colouriser.see(xyz)
+    colouriser.finish([photo])
+    over, black = colouriser.colour(xyz, before=before), colouriser.colour(xyz)
+    unseen = over.source == 0
+    assert 0.2 < unseen.mean() < 0.8 and np.array_equal(before, kept)
+    assert np.array_equal(over.rgb[unseen], before[unseen]) and not black.rgb[unseen].any()
+    assert np.array_equal(over.rgb[~unseen], black.rgb[~unseen]) and black.rgb[~unseen].all()
+
+
+def test_doubtful_colours_leave_the_old_ones(rng):
+    (view, *_) = ring(4, (120, 90))
+    names = ("rx", "ry", "rz", "cx_world", "cy_world", "cz_world")
+    view = View(view.name, None, view.camera, view.pose, covariance=Covariance(names, np.eye(6) * 1e-6))
+    xyz, before = panorama(4_000), np.full((4_000, 3), 777, np.uint16)
+    colouriser = Colouriser([view], ColouriseOptions(max_sigma=1e-9))
+    colouriser.see(xyz)
+    colouriser.finish([np.full((90, 120, 3), 9, np.uint8)])
+    found = colouriser.colour(xyz, before=before)
+    assert not found.source.any() and (found.rgb == 777).all() and np.isnan(found.sigma).all()

@@ -165,7 +165,7 @@ class LasReader(CloudReader):
             selection = laz.POSITIONS if positions_only else laz.POSITIONS_AND_COLOUR
             for block in self.laz.blocks(file, size):
                 if layered:
-                    yield LasChunk(self, start, self.laz.decode(block, selection), block, complete=False)
+                    yield LasChunk(self, start, self.laz.decode(block, selection), block, selection)
                 else:
                     yield LasChunk(self, start, self.laz.decode(block), block)
                 start += block.n_points
@@ -212,7 +212,7 @@ class LasChunk(CloudChunk):
         start: int,
         records: npt.NDArray[np.uint8],
         block: laz.Block | None,
-        complete: bool = True,
+        selection: int = laz.EVERYTHING,
     ) -> None:
         header = reader.header
         self.start = start
@@ -222,7 +222,8 @@ class LasChunk(CloudChunk):
         self.xyz = np.empty((len(records), 3))  # of numpy's own, as it asks the system for large pages
         _core.scaled_xyz(records, np.array(header.scale), np.array(header.offset), self.xyz)
         self._reader = reader
-        self._complete = complete
+        self._complete = selection == laz.EVERYTHING
+        self._coloured = selection in (laz.EVERYTHING, laz.POSITIONS_AND_COLOUR)
 
     @cached_property
     def records(self) -> npt.NDArray[np.uint8]:
@@ -247,7 +248,9 @@ class LasChunk(CloudChunk):
     @property
     def rgb(self) -> npt.NDArray[np.uint16] | None:
         at = RGB_OFFSET.get(self._reader.header.point_format)
-        return None if at is None else take(self.records, at, "(3,)<u2")
+        if at is None:
+            return None
+        return take(self.positions if self._coloured else self.records, at, "(3,)<u2")
 
     @property
     def normals(self) -> AnyArray | None:

@@ -26,6 +26,10 @@ app = typer.Typer(
     add_completion=False,
 )
 
+ToleranceOption = Annotated[
+    float | None,
+    typer.Option(help="Noise of the cloud's depths, in parts of the depth: 0.003; for depth cameras 0.01."),
+]
 ReportOption = Annotated[Path | None, typer.Option(metavar="FILE", help="Write a report for people (HTML).")]
 JsonOption = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the result for machines.")]
 
@@ -176,6 +180,7 @@ def sci(
     out: Annotated[Path, typer.Option(help="Folder for the pictures.")],
     bits: Annotated[int, typer.Option(help="Of the intensity picture: 8 or 16.")] = 8,
     fill: Annotated[int, typer.Option(help="The widest hole to be filled, pixels; 0 fills none.")] = 8,
+    tolerance: ToleranceOption = None,
     json_file: JsonOption = None,
 ) -> None:
     """Renders the synthetic camera image of a view: intensity, depth and point index."""
@@ -190,7 +195,7 @@ def sci(
     result = []
     for one in registration.views:
         folder = out if len(registration.views) == 1 else out / one.name
-        image = render_sci(points, one, bits=16 if bits == 16 else 8 if bits == 8 else bits, fill=fill)  # type: ignore[arg-type]
+        image = render_sci(points, one, bits=bits, fill=fill, tolerance=tolerance)  # type: ignore[arg-type]
         write_sci(folder, image)
         measured, seen = float(image.measured.mean()), float(image.seen.mean())
         by_range, by_incidence = image.exponents
@@ -279,10 +284,7 @@ def colourise(
     max_sigma: Annotated[
         float | None, typer.Option(help="Metres of ColourSigma beyond which nothing is coloured.")
     ] = None,
-    tolerance: Annotated[
-        float | None,
-        typer.Option(help="Noise of the cloud's depths, in parts of the depth: 0.003; for depth cameras 0.01."),
-    ] = None,
+    tolerance: ToleranceOption = None,
     level: Annotated[bool, typer.Option(help="Level exposure and white balance between photos.")] = False,
     chunk: Annotated[int, typer.Option(help="Points held at a time.", min=1000)] = 1_000_000,
     json_file: JsonOption = None,

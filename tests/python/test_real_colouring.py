@@ -19,6 +19,7 @@ from colourreg_rs import (
     _core,
     read_cloud,
     read_photo,
+    write_cloud,
     write_registration,
 )
 from colourreg_rs.experiments.sci_accuracy import disturbed
@@ -95,6 +96,22 @@ def test_a_room_seen_one_degree_beside_is_worse(data_dir, tmp_path):
     both = scene.seen & (right.source > 0) & (wrong.source > 0)
     a, b = (Comparison.of(found.rgb[both], scene.colours[both]) for found in (right, wrong))
     assert a.correlation > 0.985 > 0.96 > b.correlation and b.mean > 2 * a.mean
+
+
+def test_the_sci_of_a_room_by_the_command(data_dir, tmp_path):
+    scene = scenes.living_room(data_dir, tmp_path, 0, 4)
+    write_cloud(tmp_path / "own.ply", PointCloud(positions(scene), rgb=(scene.colours * 256).astype(np.uint16)))
+    seen = {}
+    for tolerance in ("0.003", "0.01"):
+        command = [sys.executable, "-m", "colourreg_rs.cli", "sci", tmp_path / "own.ply", "--view", scene.registration]
+        told = tmp_path / "told.json"
+        options = ["--out", tmp_path / "sci", "--tolerance", tolerance, "--json", told]
+        done = subprocess.run([*command, *options], capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        (view,) = json.loads(told.read_text())
+        seen[tolerance] = view["measured"] + view["filled"]
+    seen_by_both = scene.seen.sum() / (640 * 480)
+    assert seen_by_both < seen["0.01"] < 1 and seen["0.01"] > seen["0.003"]
 
 
 def test_a_room_is_registered_by_its_sci(data_dir, tmp_path, rng):

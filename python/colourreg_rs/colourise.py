@@ -265,7 +265,7 @@ def colourise_file(
             try:
                 _first_pass(reader, colouriser, photos, filled, progress)
             except BaseException:
-                decoder.shutdown(wait=False, cancel_futures=True)
+                photos.stop()
                 raise
         coloured, counts, sigmas = _second_pass(reader, writer, colouriser, progress)
         if coloured == 0:

@@ -35,6 +35,7 @@ class PhotoShelf:
         self._limit = limit
         self._held: OrderedDict[int, Pixels] = OrderedDict()
         self._absent: dict[tuple[int, int], Pixels] = {}
+        self._stopped = False
         self.decoded = 0
 
     @classmethod
@@ -57,10 +58,16 @@ class PhotoShelf:
     def fill(self) -> None:
         """Decodes photos in their order until the limit is reached: all of them, where that is possible."""
         for number in range(len(self)):
+            if self._stopped:
+                return
             if number not in self._held:
                 if self.held_bytes + 3 * int(np.prod(self._sizes[number])) > self._limit:
                     return
                 self._decode([number])
+
+    def stop(self) -> None:
+        """Ends :meth:`fill` in another thread after the photo that it is at."""
+        self._stopped = True
 
     def take(self, wanted: Collection[int]) -> list[Pixels]:
         """One picture for each photo: those wanted, and for the others one of their size that must not be read."""

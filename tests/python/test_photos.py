@@ -81,6 +81,20 @@ def test_arrays_stay_where_they_are(rng):
     assert shelf.take({0, 2})[2] is photos[2] and shelf.decoded == 0
 
 
+def test_a_run_that_fails_does_not_decode_all_its_photos():
+    decoded = []
+
+    def load(number):
+        decoded.append(number)
+        if number == 1:
+            shelf.stop()
+        return np.zeros((20, 30, 3), np.uint8)
+
+    shelf = PhotoShelf([partial(load, number) for number in range(9)], [(30, 20)] * 9)
+    shelf.fill()
+    assert decoded == [0, 1]
+
+
 RUN = """
 import re, sys
 from pathlib import Path

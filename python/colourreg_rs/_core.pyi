@@ -316,6 +316,35 @@ def information_distance(
     many points lie in the photo. Source: Stewart and Newman, LAPS, ICRA 2012. Raises DegenerateError below 100
     points."""
 
+class RegressionPhoto:
+    """A photo's channels (C, H, W), 1 to 4 of them, blurred by ``sigma`` px, prepared for :func:`regress_patches`.
+    Immutable."""
+
+    def __init__(self, channels: npt.NDArray[np.float32], *, sigma: float = 0.0) -> None: ...
+
+def regress_patches(
+    photo: RegressionPhoto,
+    xy: FloatArray,
+    design: FloatArray,
+    values: npt.NDArray[np.float32],
+    members: npt.NDArray[np.int64],
+    ends: npt.NDArray[np.int64],
+    *,
+    least_points: int = 40,
+    cut: float = ...,
+    order: int = 2,
+    ridge: float = 1e-3,
+) -> dict[str, FloatArray]:
+    """Explains intensities (N,) of points, patch by patch, by a linear function of the photo's channels at their places
+    ``xy`` (N, 2), px, and a polynomial of ``order`` 0 to 2 in the places; ``design`` (N, 2, U) has the places'
+    derivatives by U parameters. ``members`` lists the points of all patches one after the other, ``ends`` (K,) where
+    each ends. Points beyond ``cut`` robust standard deviations are left out (Tukey's biweight; by default none).
+
+    Returns for each patch ``gradient`` (K, U) and Gauss-Newton ``information`` (K, U, U) of its log-likelihood
+    ``value`` (K,), ``-n/2 log(1 - R²)``; the share R² ``explained`` (K,) of the variance; and ``points`` (K,), the sum
+    of weights. A patch of fewer than ``least_points``, or one that explains nothing, has zeros. Sources: Golub and
+    Pereyra 1973; Kaufman 1975. Raises InvalidInputError."""
+
 def rank(values: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     """Ranks of values (N,), 0 to 1; equal values share the middle of theirs."""
 

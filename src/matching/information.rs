@@ -8,6 +8,7 @@
 use rayon::prelude::*;
 
 use super::plane::Plane;
+use super::spline::spline;
 use crate::error::{Error, Result};
 use crate::geometry::View;
 
@@ -93,16 +94,6 @@ pub fn ranks(values: &[f32]) -> Vec<f32> {
         start = end;
     }
     out
-}
-
-/// The four cubic B-spline weights around t in [0, 1], and their derivatives.
-fn spline(t: f64) -> ([f64; 4], [f64; 4]) {
-    let (s, t2) = (1.0 - t, t * t);
-    let t3 = t2 * t;
-    (
-        [s * s * s / 6.0, (4.0 - 6.0 * t2 + 3.0 * t3) / 6.0, (1.0 + 3.0 * t + 3.0 * t2 - 3.0 * t3) / 6.0, t3 / 6.0],
-        [-0.5 * s * s, (-12.0 * t + 9.0 * t2) / 6.0, (3.0 + 6.0 * t - 9.0 * t2) / 6.0, 0.5 * t2],
-    )
 }
 
 struct Histogram {

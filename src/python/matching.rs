@@ -4,11 +4,14 @@ use numpy::{PyArray1, PyArray2};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-use super::arrays::{Input, owned, owned_rows, points3};
+use super::arrays::{Input, owned, owned_rows, points2, points3};
 use super::geometry::PyView;
 use crate::error::Error;
 use crate::matching::channels::{ChannelOptions, Tuning};
-use crate::matching::{self, Features, InformationPhoto, InterestOptions, Measure, Outcome, Plane, TemplateOptions};
+use crate::matching::{
+    self, Features, InformationPhoto, InterestOptions, Measure, Outcome, Plane, RegressionOptions, RegressionPhoto,
+    TemplateOptions,
+};
 
 fn plane(array: &Bound<'_, PyAny>, name: &str) -> PyResult<Plane> {
     let input = Input::<f32>::new(array, name, &[None, None])?;
@@ -249,6 +252,70 @@ fn information_distance<'py>(
     Ok((found.distance, PyArray1::from_slice(py, &found.gradient), found.points))
 }
 
+#[pyclass(frozen, name = "RegressionPhoto", module = "colourreg_rs._core")]
+pub(super) struct PyRegressionPhoto(RegressionPhoto);
+
+#[pymethods]
+impl PyRegressionPhoto {
+    #[new]
+    #[pyo3(signature = (channels, *, sigma=0.0))]
+    fn new(py: Python<'_>, channels: &Bound<'_, PyAny>, sigma: f32) -> PyResult<Self> {
+        let input = Input::<f32>::new(channels, "channels", &[None, None, None])?;
+        let (height, width) = (input.shape()[1], input.shape()[2]);
+        let values = input.values()?;
+        let made = py.detach(|| {
+            let size = (width * height).max(1);
+            let planes = values.chunks_exact(size).map(|c| Plane::new(width, height, c.to_vec()));
+            RegressionPhoto::new(planes.collect::<Result<_, _>>()?, sigma)
+        });
+        Ok(Self(made?))
+    }
+}
+
+#[pyfunction]
+#[pyo3(signature = (photo, xy, design, values, members, ends, *, least_points=40, cut=f64::INFINITY, order=2, ridge=1e-3))]
+#[allow(clippy::too_many_arguments, reason = "keywords of the Python function")]
+fn regress_patches<'py>(
+    py: Python<'py>,
+    photo: &PyRegressionPhoto,
+    xy: &Bound<'py, PyAny>,
+    design: &Bound<'py, PyAny>,
+    values: &Bound<'py, PyAny>,
+    members: &Bound<'py, PyAny>,
+    ends: &Bound<'py, PyAny>,
+    least_points: usize,
+    cut: f64,
+    order: usize,
+    ridge: f64,
+) -> PyResult<Bound<'py, PyDict>> {
+    let (xy, values) = (points2(xy, "xy")?, Input::<f32>::new(values, "values", &[None])?);
+    let design = Input::<f64>::new(design, "design", &[None, Some(2), None])?;
+    let (members, ends) = (Input::<i64>::new(members, "members", &[None])?, Input::<i64>::new(ends, "ends", &[None])?);
+    let parameters = design.shape()[2];
+    let (points, design, values, members) = (xy.rows::<2>()?, design.values()?, values.values()?, members.values()?);
+    let (mut start, mut patches) = (0, Vec::with_capacity(ends.values()?.len()));
+    for end in ends.values()? {
+        let end = usize::try_from(*end).unwrap_or(usize::MAX);
+        let Some(patch) = members.get(start..end) else {
+            return Err(Error::invalid("ends must rise and not go beyond the members").into());
+        };
+        patches.push(patch);
+        start = end;
+    }
+    let options = RegressionOptions { least_points, cut, order, ridge };
+    let found = py.detach(|| matching::regress_patches(&photo.0, points, design, values, &patches, &options))?;
+    let n = found.len();
+    let out = PyDict::new(py);
+    let gradients = found.iter().flat_map(|p| p.gradient.iter().copied()).collect();
+    let information = found.iter().flat_map(|p| p.information.iter().copied()).collect();
+    out.set_item("gradient", owned(py, gradients, [n, parameters])?)?;
+    out.set_item("information", owned(py, information, [n, parameters, parameters])?)?;
+    out.set_item("value", PyArray1::from_iter(py, found.iter().map(|p| p.value)))?;
+    out.set_item("explained", PyArray1::from_iter(py, found.iter().map(|p| p.explained)))?;
+    out.set_item("points", PyArray1::from_iter(py, found.iter().map(|p| p.points)))?;
+    Ok(out)
+}
+
 #[pyfunction]
 fn rank<'py>(py: Python<'py>, values: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyArray1<f32>>> {
     let input = Input::<f32>::new(values, "values", &[None])?;
@@ -259,6 +326,7 @@ fn rank<'py>(py: Python<'py>, values: &Bound<'py, PyAny>) -> PyResult<Bound<'py,
 pub(super) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_class::<PyFeatures>()?;
     m.add_class::<PyInformationPhoto>()?;
+    m.add_class::<PyRegressionPhoto>()?;
     m.add("MATCH_OUTCOMES", Outcome::ALL.map(Outcome::name).to_vec())?;
     m.add_function(wrap_pyfunction!(resize, m)?)?;
     m.add_function(wrap_pyfunction!(interest_points, m)?)?;
@@ -267,5 +335,6 @@ pub(super) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(score_templates, m)?)?;
     m.add_function(wrap_pyfunction!(relief, m)?)?;
     m.add_function(wrap_pyfunction!(information_distance, m)?)?;
+    m.add_function(wrap_pyfunction!(regress_patches, m)?)?;
     m.add_function(wrap_pyfunction!(rank, m)?)
 }

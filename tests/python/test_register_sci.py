@@ -14,7 +14,8 @@ from colourreg_rs.experiments.sci_accuracy import STARTS, disturbed, register, s
 from colourreg_rs.io.clouds import write_cloud
 from colourreg_rs.io.images import write_image
 from colourreg_rs.io.registration import read_registration, write_registration
-from colourreg_rs.matching.match_covariance import design, match_covariance
+from colourreg_rs.matching.match_covariance import match_covariance
+from colourreg_rs.matching.parameters import design
 from colourreg_rs.matching.register_sci import SciOptions, register_sci
 from colourreg_rs.model import Registration
 from colourreg_rs.simulate import simulate

@@ -29,7 +29,7 @@ from ..matching.correspondences import (
     pixels_per_radian,
     supported_scale,
 )
-from ..matching.match_covariance import design
+from ..matching.parameters import design
 from ..model import FloatArray, PointCloud, View
 
 #: Significance of the test of the field.

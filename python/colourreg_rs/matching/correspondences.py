@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -55,8 +56,9 @@ class Correspondences:
 
 @dataclass
 class PhotoPyramid:
-    """A photo's grey values, and its features at the sizes that were asked for."""
+    """A photo, its grey values, and its features at the sizes that were asked for."""
 
+    pixels: npt.NDArray[Any]
     grey: npt.NDArray[np.float32]
     _features: dict[tuple[int, int], _core.Features] = field(default_factory=dict)
 
@@ -64,7 +66,7 @@ class PhotoPyramid:
     def of(cls, pixels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16] | npt.NDArray[np.float32]) -> PhotoPyramid:
         """From a photo (H, W) or (H, W, 3)."""
         grey = pixels if pixels.ndim == 2 else pixels[:, :, :3] @ LUMINANCE
-        return cls(np.ascontiguousarray(grey, dtype=np.float32))
+        return cls(pixels, np.ascontiguousarray(grey, dtype=np.float32))
 
     def at(self, width: int, height: int) -> _core.Features:
         """The features at a size."""

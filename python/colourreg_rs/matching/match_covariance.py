@@ -9,6 +9,9 @@ everywhere. Taken as independent, a thousand matches promise a tenth of the erro
 - an error common to all matches, a shift of the whole SCI by a share of its pixel, which no residual shows;
 - and a factor for what errs alike wherever the same is built.
 
+The patches of the last step (:mod:`.pointwise`) are treated like matches: their gradients sum up in ``G``, their
+information in ``H``.
+
 How well this holds is measured by ``python -m colourreg_rs.experiments.sci_accuracy``.
 """
 
@@ -20,6 +23,8 @@ import numpy as np
 
 from .. import _core
 from ..model import Covariance, FloatArray, View
+from .parameters import design
+from .pointwise import Patches
 
 #: The distance over which matches err together, as one sigma of a Gaussian and a share of the photo's long side.
 CORRELATION_LENGTH = 0.18
@@ -31,27 +36,8 @@ COMMON = 0.15
 #: above were set on façades and rooms with seeds 0 to 9.
 SYSTEMATIC = 2.5
 
-_POSE = ("rx", "ry", "rz", "cx_world", "cy_world", "cz_world")
-
-
-def design(view: View, names: Sequence[str], xyz: FloatArray) -> FloatArray:
-    """Derivatives of pixels (N, 2, U) by the named parameters, as covariances count them; NaN where not visible."""
-    _, _, pose, params = _core.project_jacobians(view.core, xyz)
-    camera = view.camera
-    assert camera is not None
-    order = list(camera.params)
-
-    def column(name: str) -> FloatArray:
-        if name in _POSE:
-            return pose[:, :, _POSE.index(name)]
-        if name in ("f", "aspect"):
-            fx, fy = (params[:, :, order.index(n)] for n in ("fx", "fy"))
-            if name == "aspect":
-                return fy * camera.params["fx"]
-            return fx + fy * (camera.params["fy"] / camera.params["fx"])
-        return params[:, :, order.index(name)]
-
-    return np.stack([column(name) for name in names], axis=2)
+#: The same two for patches of points, which no picture shifts.
+PATCHES_COMMON, PATCHES_SYSTEMATIC = 0.05, 2.5
 
 
 def match_covariance(
@@ -77,33 +63,73 @@ def match_covariance(
     rows = factors @ design(view, names, xyz)
     if not (np.isfinite(rows).all() and np.isfinite(residual).all()) or len(rows) < len(names):
         return None
+    information = np.einsum("nki,nkj->nij", rows, rows)
+    gradients = np.einsum("nki,nk->ni", rows, residual)
+    # What a shift of all matches by one px in x, in y, adds to the gradient.
+    shifted = np.stack([np.einsum("nki,nk->i", rows, factors[:, :, axis]) for axis in range(2)])
+    common = COMMON * pixel
+    return _sandwich(view, names, xy, information, gradients, shifted * common, SYSTEMATIC)
+
+
+def patch_covariance(view: View, patches: Patches, seen: FloatArray, pixel: float) -> Covariance | None:
+    """The covariance of a view's parameters from ``patches`` at the view; ``None`` where they do not determine them.
+
+    Args:
+        view: the view.
+        patches: what they say of it.
+        seen: (N, 3) points all over the photo, through which an error common to all acts.
+        pixel: the size of the level's pixel in the photo, px.
+    """
+    information = patches.information.sum(0)
+    slopes = design(view, patches.names, seen)
+    slopes = slopes[np.isfinite(slopes).all((1, 2))]
+    normal = np.einsum("nki,nkj->ij", slopes, slopes)
+    if not np.isfinite(information).all() or np.linalg.matrix_rank(normal) < len(patches.names):
+        return None
+    # The change of the parameters that comes nearest to a shift of all the picture, as a gradient that makes it.
+    shifts = np.linalg.solve(normal, slopes.sum(0).T).T
+    return _sandwich(
+        view, patches.names, patches.places, patches.information, patches.gradient,
+        shifts @ information * (PATCHES_COMMON * pixel), PATCHES_SYSTEMATIC,
+    )  # fmt: skip
+
+
+def _sandwich(
+    view: View,
+    names: Sequence[str],
+    places: FloatArray,
+    information: FloatArray,
+    gradients: FloatArray,
+    common: FloatArray,
+    systematic: float,
+) -> Covariance | None:
+    """``H⁻¹ G H⁻¹`` of information (K, U, U) and gradients (K, U) at places (K, 2), with errors common to all, whose
+    gradients are ``common`` (C, U)."""
     # Columns of length 1 for the numbers' sake.
-    size = np.sqrt((rows**2).sum((0, 1)))
+    size = np.sqrt(np.diagonal(information, axis1=1, axis2=2).sum(0))
     if not (size > 0).all():
         return None
-    rows = rows / size
-    curvature = np.einsum("nki,nkj->ij", rows, rows)
+    scaled = information / np.outer(size, size)
+    gradients, common = gradients / size, common / size
+    curvature = scaled.sum(0)
     eigenvalues = np.linalg.eigvalsh(curvature)
     if eigenvalues[0] <= 1e-12 * eigenvalues[-1] or eigenvalues[0] <= 0:
         return None
-    gradients = np.einsum("nki,nk->ni", rows, residual)
     long_side = max(view.core.width, view.core.height)
     # Dense, but of float32 and of at most some thousand matches.
-    place = (xy / (CORRELATION_LENGTH * long_side)).astype(np.float32)
+    place = (places / (CORRELATION_LENGTH * long_side)).astype(np.float32)
     square = (place**2).sum(1)
     kernel = np.exp(-0.5 * np.maximum(square[:, None] + square[None] - 2 * place @ place.T, 0))
     filling = gradients.T @ (kernel.astype(np.float64) @ gradients)
     # Independent places: (Σ w)² / Σ w w' K, each weighing what it contributes; each parameter uses one half of a
     # match's two coordinates.
-    weight = (rows**2).sum((1, 2))
-    places = float(weight.sum() ** 2 / (weight @ kernel @ weight))
-    correction = places / max(places - 0.5 * len(names), 1.0)
+    weight = np.trace(scaled, axis1=1, axis2=2)
+    independent = float(weight.sum() ** 2 / (weight @ kernel @ weight))
+    correction = independent / max(independent - 0.5 * len(names), 1.0)
     inverse = np.linalg.inv(curvature)
     total = correction * inverse @ filling @ inverse
-    # A shift of all matches by one px in x, in y.
-    for axis in range(2):
-        shifted = np.einsum("nki,nk->i", rows, factors[:, :, axis])
-        effect = inverse @ shifted * (COMMON * pixel)
+    for gradient in common:
+        effect = inverse @ gradient
         total += np.outer(effect, effect)
-    total = SYSTEMATIC * total / np.outer(size, size)
+    total = systematic * total / np.outer(size, size)
     return Covariance(tuple(names), 0.5 * (total + total.T))

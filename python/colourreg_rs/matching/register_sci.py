@@ -3,8 +3,8 @@
 The SCI is rendered at the current view and matched with the photo; resection gives the next view; and the SCI is
 rendered again, until the view stands still. Coarse to fine: at the coarsest level templates span many degrees, are
 searched over the whole of the start's uncertainty, each for itself, and a robust resection takes those that agree; from
-there on all templates are taken together (:mod:`.surfaces`). The single pass of Forkuo and King is the first turn
-alone, at the finest level.
+there on all templates are taken together (:mod:`.surfaces`). At the finest level the last word is the points' own, at
+their own places (:mod:`.pointwise`). The single pass of Forkuo and King is the first turn alone, at the finest level.
 
 A result is believed only if the patches of the photo, each searched far beyond its own noise, come back to where they
 were (``confirmed``); one that is not is returned as a failure, with the figures that say so.
@@ -31,7 +31,9 @@ from .correspondences import (
     pixels_per_radian,
     supported_scale,
 )
-from .match_covariance import design, match_covariance
+from .match_covariance import match_covariance, patch_covariance
+from .parameters import design, stepped, value_of
+from .pointwise import LOOKS, STEPS, STRIDE, Look, Patches, PointwisePhoto
 from .surfaces import Linearised, Surfaces, find_surfaces, joined
 
 #: The finest level has this many pixels per spacing of the points: matches err by a share of the level's pixel,
@@ -41,7 +43,7 @@ OVERSAMPLING = 3.0
 #: The coarsest level has about this many pixels along the long side.
 COARSEST = 300
 
-#: So many renderings of the finest level are taken together.
+#: So many renderings of a level are taken together.
 TOGETHER = 4
 
 #: Single templates whose likeness is less than this are no match.
@@ -63,8 +65,8 @@ class SciOptions:
     - ``shift``: how far off the start's projection centre may be, metres, one sigma; for the coarse levels only.
     - ``priors``: (name, value, sigma) of parameters known before, as in resection; they hold at every level.
     - ``tolerance``: the loop ends when the view moves less than this anywhere in the photo, px.
-    - ``passes``: at most this many turns at the finest level; 1 with ``single`` is the single pass of the literature.
-    - ``single``: one turn at the finest level and nothing else.
+    - ``passes``: at most this many turns of templates at every level, and two at the finest.
+    - ``single``: one turn at the finest level and nothing else: the single pass of the literature.
     - ``station``: (3,) where the scanner stood, for the correction of the intensity.
     """
 
@@ -73,15 +75,15 @@ class SciOptions:
     shift: float = 0.5
     priors: tuple[tuple[str, float, float], ...] = ()
     tolerance: float = 0.1
-    passes: int = 8
+    passes: int = 3
     single: bool = False
     station: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True)
 class Turn:
-    """One turn of the loop: at ``scale`` of the photo, ``templates`` were searched, ``matched`` are alike, and the view
-    ``moved`` this far at most anywhere in the photo, px."""
+    """One turn of the loop: at ``scale`` of the photo, ``templates`` (or patches of points) were compared, ``matched``
+    are alike, and the view ``moved`` this far at most anywhere in the photo, px."""
 
     scale: float
     templates: int
@@ -201,7 +203,7 @@ class _Loop:
         for level, scale in enumerate(scales):
             finest = level == len(scales) - 1
             renderings: list[Surfaces] = []
-            for turn in range(self.options.passes if finest else 3):
+            for turn in range(min(self.options.passes, 2) if finest else self.options.passes):
                 found = self._surfaces(view, scale, 8 if turn == 0 else 5, turn)
                 # Every rendering has noise of its own: where points happen to lie in their pixels. Taken together, the
                 # last few have less of it, and the view comes to rest.
@@ -211,9 +213,9 @@ class _Loop:
                 moved = self._moved(view, new)
                 self.turns.append(Turn(scale, len(found), int((found.here > LIKE).sum()), moved))
                 view, self.last = new, found
-                if moved < (self.options.tolerance if finest else 0.5 / scale):
+                if moved < 0.5 / scale:
                     break
-        return view
+        return self._settled(view)
 
     def _from_afar(self, view: View, scale: float) -> View:
         """The first turn: large templates, each searched over the whole of the start's uncertainty."""
@@ -256,6 +258,43 @@ class _Loop:
             if moved < 0.2 * self.options.tolerance:
                 break
         return view
+
+    def _settled(self, view: View) -> View:
+        """The view at which the photo explains most of the points' intensities, from here upwards."""
+        scale = self.turns[-1].scale
+        width, height = self.last.level
+        photo = PointwisePhoto(self.photo.pixels, width, height)
+        for _ in range(LOOKS):
+            before, spacing = view, scale / self.supported
+            look = Look.at(self.cloud, view, self.names, photo, spacing, self.station, self.exponents)
+            for _ in range(STEPS):
+                found = look.patches(view)
+                new = stepped(view, self.names, STRIDE * self._step(view, found))
+                moved, view = self._moved(view, new), new
+                if moved < 0.2 * self.options.tolerance:
+                    break
+            self.patches = look.patches(view)
+            alike = int((self.patches.explained > LIKE).sum())
+            self.turns.append(Turn(scale, len(self.patches.value), alike, self._moved(before, view)))
+            if self.turns[-1].moved < self.options.tolerance:
+                break
+        return view
+
+    def _step(self, view: View, patches: Patches) -> FloatArray:
+        """The Gauss-Newton step of the patches and of what is known before."""
+        information, gradient = patches.information.sum(0), patches.gradient.sum(0)
+        for name, value, sigma in self.options.priors:
+            if name in self.names and sigma > 0:
+                k = self.names.index(name)
+                information[k, k] += sigma**-2
+                gradient[k] += (value - value_of(view, name)) / sigma**2
+        size = np.sqrt(np.diagonal(information))
+        if not (np.isfinite(size).all() and (size > 0).all()):
+            raise _LoopError("the photo explains nothing of the points' intensities")
+        scaled = information / np.outer(size, size)
+        if np.linalg.eigvalsh(scaled)[0] < 1e-12:
+            raise _LoopError("the points' intensities do not determine the view")
+        return np.asarray(np.linalg.solve(scaled, gradient / size) / size)
 
     def _find(self, view: View, scale: float, search: Search) -> Correspondences:
         found, sci = find_correspondences(
@@ -349,7 +388,10 @@ class _Loop:
         if used < 20:
             reasons.append(f"only {used} templates are alike at the view; 20 are needed")
         matches = found.linearised(view)
-        covariance = match_covariance(view, self.names, matches.xyz, matches.xy, matches.covariance, found.pixel)
+        if self.options.single:
+            covariance = match_covariance(view, self.names, matches.xyz, matches.xy, matches.covariance, found.pixel)
+        else:
+            covariance = patch_covariance(view, self.patches, self.witnesses, found.pixel)
         predicted = float("nan")
         if covariance is None:
             reasons.append("the matches do not determine the view")

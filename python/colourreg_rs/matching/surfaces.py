@@ -90,6 +90,12 @@ class Surfaces:
         return self.scores[:, self.radius, self.radius].astype(np.float64)
 
     @property
+    def level(self) -> tuple[int, int]:
+        """Width and height of the level, px."""
+        width, height = np.round(self.size / self.scale).astype(int).tolist()
+        return width, height
+
+    @property
     def pixel(self) -> float:
         """The size of the level's pixel in the photo, px."""
         return float(self.scale.mean())

@@ -43,11 +43,20 @@ fn diagonal<const D: usize>(sigma: f64) -> [[f64; D]; D] {
 }
 
 fn adjusted(view: &View, n: usize, free: &FreeSet, options: &FullOptions) -> ViewAdjustment {
+    with_blunders(view, n, 0, free, options)
+}
+
+/// So many points, some of which are off by up to 40 px.
+fn with_blunders(view: &View, n: usize, blunders: usize, free: &FreeSet, options: &FullOptions) -> ViewAdjustment {
     let mut random = Uniform(7);
     let exact = points(view, n, &mut random);
-    let mut noise = |x: f64, sigma: f64| x + sigma * 3.46 * (random.next() - 0.5);
-    let xy: Vec<[f64; 2]> = exact.iter().map(|p| view.project(p).unwrap().0.map(|x| noise(x, 0.5))).collect();
+    // Twelve uniform numbers make nearly a normal one.
+    let mut noise = |x: f64, sigma: f64| x + sigma * ((0..12).map(|_| random.next()).sum::<f64>() - 6.0);
+    let mut xy: Vec<[f64; 2]> = exact.iter().map(|p| view.project(p).unwrap().0.map(|x| noise(x, 0.5))).collect();
     let xyz: Vec<[f64; 3]> = exact.iter().map(|p| p.map(|x| noise(x, 0.003))).collect();
+    for k in 0..blunders {
+        xy[k * n / blunders][k % 2] += 80.0 * (random.next() - 0.5);
+    }
     let (covariance_xyz, covariance_xy) = (vec![diagonal(0.003); n], vec![diagonal(0.5); n]);
     let points = ControlPoints { xyz: &xyz, xy: &xy, covariance_xyz: &covariance_xyz, covariance_xy: &covariance_xy };
     let mut start = *view;
@@ -68,6 +77,13 @@ fn adjustment(c: &mut Criterion) {
     group.bench_function("pose, f, pp, distortion, 10000 points, all statistics", |b| {
         b.iter(|| adjusted(&view(), 10_000, &calibration, &FullOptions::default()));
     });
+    for (names, free) in [("pose", &pose), ("pose, f, pp, distortion", &calibration)] {
+        for blunders in [0, 100] {
+            group.bench_function(format!("snooping, {names}, 10000 points, {blunders} blunders"), |b| {
+                b.iter(|| with_blunders(&view(), 10_000, blunders, free, &FullOptions::default()));
+            });
+        }
+    }
     let components = FullOptions { components: true, ..FullOptions::default() };
     group.bench_function("the same with variance components", |b| {
         b.iter(|| adjusted(&view(), 10_000, &calibration, &components));

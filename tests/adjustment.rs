@@ -269,6 +269,43 @@ fn blunders_are_named_and_the_rest_is_as_if_they_had_never_been() {
 }
 
 #[test]
+fn snooping_many_points_is_adjusting_after_each_rejection() {
+    // Of many points most rejections need no iteration: the answer is that of iterating after each.
+    let mut random = Noise(11);
+    let mut scene = scene(400, [0.0; 3], &mut random, 0.5, 0.003);
+    for i in (0..400).step_by(23) {
+        scene.xy[i][i % 2] += 2.0 + 40.0 * random.uniform().powi(3);
+    }
+    let free = FreeSet::parse(Model::OpenCv, &["pose", "f", "pp", "distortion"]).unwrap();
+    for estimated in [true, false] {
+        let options = |snoop: bool| {
+            let mut options = FullOptions { snoop, ..FullOptions::default() };
+            options.levels.estimated = estimated;
+            options
+        };
+        let result = scene.adjust(&free, &options(true)).unwrap();
+        assert!(result.adjusted.rejected.len() >= 10);
+        let (mut left, mut numbers) = (scene.without(400), (0..400).collect::<Vec<usize>>());
+        let mut rejected = result.adjusted.rejected.iter();
+        let clean = loop {
+            let again = left.adjust(&free, &options(false)).unwrap();
+            let statistics = || again.adjusted.points.iter().map(|p| p.reliability.statistic);
+            let worst = statistics().enumerate().max_by(|a, b| a.1.total_cmp(&b.1)).unwrap();
+            if worst.1 <= again.adjusted.critical {
+                break again;
+            }
+            let named = rejected.next().unwrap();
+            assert_eq!(named.point, numbers.remove(worst.0));
+            assert!((named.statistic / worst.1 - 1.0).abs() < 1e-3, "{} {}", named.statistic, worst.1);
+            assert!((named.critical / again.adjusted.critical - 1.0).abs() < 1e-9);
+            left = left.without(worst.0);
+        };
+        assert!(rejected.next().is_none());
+        assert!((clean.view.pose.centre - result.view.pose.centre).norm() < 1e-9);
+    }
+}
+
+#[test]
 fn what_is_not_determined_is_refused_by_name() {
     let scene = scene(30, [0.0; 3], &mut Noise(7), 0.5, 0.003);
     let named = |error: Error, word: &str| {

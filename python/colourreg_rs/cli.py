@@ -230,11 +230,15 @@ def register(
     sigma_xyz: Annotated[
         float | None, typer.Option(help="Sigma of an object coordinate in metres, where the list has none; else 0.")
     ] = None,
-    loss: Annotated[str | None, typer.Option(help="Robust loss instead of rejection: huber, cauchy, tukey.")] = None,
+    loss: Annotated[
+        str | None, typer.Option(help="Robust loss instead of rejection and adjustment: huber, cauchy, tukey.")
+    ] = None,
     distortion: Annotated[
         str, typer.Option(help="Distortion terms beside a DLT matrix, for example k1,k2,p1,p2.")
     ] = "",
-    dlt_parameters: Annotated[int, typer.Option(help="11 (h34 = 1, iterated) or 12 (singular values).")] = 11,
+    dlt_parameters: Annotated[
+        int, typer.Option(help="Approximate values by 11 (h34 = 1) or 12 (singular vector).")
+    ] = 11,
     seed: Annotated[int, typer.Option(help="Of the search for blunders.")] = 0,
     report: ReportOption = None,
     force: Annotated[

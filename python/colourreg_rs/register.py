@@ -330,14 +330,26 @@ def _by_resection(
         points=adjusted.points if adjusted else _judged(control, rough),
         statistics=adjusted.statistics if adjusted else _statistics(rough),
     )
+    notes = [f"{start.origin}; free: {', '.join(free)}", sigmas.describe()]
+    if options.loss is not None:
+        notes[1:] = [_of_loss(options.loss, sigmas)]
     return RegisterResult(
         registration=Registration((view,)),
         evaluation=evaluate_view(view),
-        notes=(f"{start.origin}; free: {', '.join(free)}", sigmas.describe()),
+        notes=tuple(notes),
         warnings=warnings,
         doubts=(*doubts, *contradictions(view)),
         free=tuple(free),
         facts={"error_in_the_middle_px": round(errors[0], 3), "error_at_the_border_px": round(errors[1], 3)},
+    )
+
+
+def _of_loss(loss: str, sigmas: PointSigmas) -> str:
+    """What a robust loss leaves out, said to whoever chose it."""
+    ignored = "; the stated sigmas in space take no part" if sigmas.space_known else ""
+    return (
+        f"robust loss {loss}: all points keep a part, coordinates in space are taken as exact{ignored}; nothing is "
+        "adjusted or tested point by point. Leave --loss out to have blunders named and photo and object adjusted together"
     )
 
 
@@ -434,9 +446,13 @@ def _statistics(result: Any) -> dict[str, float]:
     return {name: value for name, value in figures.items() if np.isfinite(value)}
 
 
+#: Where the approximate values of a DLT come from.
+_DLT_STARTS = {11: "11 parameters (h34 = 1)", 12: "12 elements (singular vector, ‖h31 h32 h33‖ = 1)"}
+
+
 def _by_dlt(photo: Path, info: PhotoInfo, control: Sequence[ControlPoint], options: RegisterOptions) -> RegisterResult:
-    """Direct Linear Transformation: nothing is known of the camera. Eleven parameters are adjusted, and their blunders
-    found; the singular vector of twelve is left as it is."""
+    """Direct Linear Transformation: nothing is known of the camera. Eleven parameters and twelve under a condition are
+    the same family of views: they differ in the approximate values, from which both are adjusted."""
     unknown = sorted(set(options.distortion) - set(DLT_DISTORTION_NAMES))
     if unknown:
         raise InvalidInputError(
@@ -455,11 +471,10 @@ def _by_dlt(photo: Path, info: PhotoInfo, control: Sequence[ControlPoint], optio
     )
     verdict, adjusted = result.verdict, None
     unadjusted: tuple[str, ...] = ()
-    if options.dlt_parameters == 11:
-        try:
-            adjusted = adjust_control(result.view, control, result.status, sigmas, options.distortion, dlt=True)
-        except (DegenerateError, NotConvergedError) as error:
-            unadjusted = (f"the points could not be adjusted, so that nothing tests them: {error}",)
+    try:
+        adjusted = adjust_control(result.view, control, result.status, sigmas, options.distortion, dlt=True)
+    except (DegenerateError, NotConvergedError) as error:
+        unadjusted = (f"the points could not be adjusted, so that nothing tests them: {error}",)
     if adjusted is not None and any(p.status == "rejected" for p in adjusted.points):
         # The blunders were in what the verdict looked at: what it says of the points in use counts.
         again = [p for p in adjusted.points if p.status != "rejected"]
@@ -495,7 +510,8 @@ def _by_dlt(photo: Path, info: PhotoInfo, control: Sequence[ControlPoint], optio
         registration=Registration((view,)),
         evaluation=evaluate_view(view),
         notes=(
-            f"DLT with {options.dlt_parameters} parameters; distortion: {', '.join(options.distortion) or 'none'}",
+            f"DLT from {_DLT_STARTS[options.dlt_parameters]}, then {'adjusted' if adjusted else 'NOT adjusted'}; "
+            f"distortion: {', '.join(options.distortion) or 'none'}",
             sigmas.describe(),
         ),
         warnings=warnings,

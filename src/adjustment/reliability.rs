@@ -20,7 +20,7 @@ use nalgebra::{DMatrix, SMatrix, SVector};
 use rayon::prelude::*;
 
 use super::distributions::Reference;
-use super::gauss_helmert::{PointFit, Solution};
+use super::gauss_helmert::{Design, PointFit, Solution};
 use crate::error::Result;
 
 /// Below this share of its misclosure a point is not controlled by the others.
@@ -127,8 +127,10 @@ pub fn reliability<S: Sync, const C: usize, const M: usize>(
         Some(t) => Some((t, t.reference.noncentrality(levels.alpha, levels.power)?)),
         None => None,
     };
+    // By rows: every point meets every place.
+    let places: Vec<Design<C>> = places.iter().map(by_rows).collect();
     let one = |(point, covariance): (&PointFit<C, M>, &SMatrix<f64, M, M>)| {
-        of_point(solution, point, covariance, places, levels, test.as_ref(), scale)
+        of_point(solution, point, covariance, &places, levels, test.as_ref(), scale)
     };
     Ok(solution.points.par_iter().zip(covariances).with_min_len(64).map(one).collect())
 }
@@ -137,7 +139,7 @@ fn of_point<S, const C: usize, const M: usize>(
     solution: &Solution<S, C, M>,
     point: &PointFit<C, M>,
     covariance: &SMatrix<f64, M, M>,
-    places: &[DMatrix<f64>],
+    places: &[Design<C>],
     levels: &TestLevels,
     test: Option<&(PointTest, f64)>,
     scale: f64,
@@ -179,14 +181,20 @@ fn of_point<S, const C: usize, const M: usize>(
     let weighted = point.weight * half;
     let to_parameters = q * DMatrix::from_fn(u, C, |k, j| (0..C).map(|i| point.design[i][k] * weighted[(i, j)]).sum());
     result.effect_on_parameters = (0..u).map(|k| size * to_parameters.row(k).norm()).collect();
-    result.effect_on_places =
-        places.iter().map(|rows| size * largest_stretch::<C>(rows, &to_parameters)).fold(0.0, f64::max);
+    let to_parameters: Design<C> = by_rows(&to_parameters.transpose());
+    let stretch = places.iter().map(|rows| largest_stretch(rows, &to_parameters, u)).fold(0.0, f64::max);
+    result.effect_on_places = size * stretch;
     result
 }
 
-/// The largest singular value of `rows · map`.
-fn largest_stretch<const C: usize>(rows: &DMatrix<f64>, map: &DMatrix<f64>) -> f64 {
-    let m = SMatrix::<f64, C, C>::from_fn(|i, j| (0..map.nrows()).map(|k| rows[(i, k)] * map[(k, j)]).sum());
+fn by_rows<const C: usize>(rows: &DMatrix<f64>) -> Design<C> {
+    std::array::from_fn(|i| std::array::from_fn(|k| rows.get((i, k)).copied().unwrap_or(0.0)))
+}
+
+/// The largest singular value of `rows · mapᵀ`, of `u` columns each.
+fn largest_stretch<const C: usize>(rows: &Design<C>, map: &Design<C>, u: usize) -> f64 {
+    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+    let m = SMatrix::<f64, C, C>::from_fn(|i, j| dot(&rows[i][..u], &map[j][..u]));
     let gram = m.transpose() * m;
     if C == 2 {
         let (a, b, d) = (gram[(0, 0)], gram[(0, 1)], gram[(1, 1)]);

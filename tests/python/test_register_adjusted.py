@@ -211,3 +211,28 @@ def test_minimal_points_are_registered_and_said_to_be_unchecked(folder, rng):
     result = register(folder, control(xyz, xy + rng.normal(0, 0.2, xy.shape)))
     assert result.view.statistics["dof"] == 2
     assert any("redundant" in w for w in result.warnings)
+
+
+def test_a_dlt_from_twelve_elements_is_adjusted_too(folder, rng):
+    # Approximate values differ, the answer does not: blunders named, regions, the same view.
+    xyz, _ = places(rng, 30)
+    plain = View("plain", None, Camera("PINHOLE", 1500, 1000, dict(list(CAMERA.params.items())[:4])), POSE)
+    xy = _core.project(plain.core, xyz)[0] + 0.5 * rng.standard_normal((30, 2))
+    xy[4] += [9.0, -4.0]
+    points = control(xyz + 0.003 * rng.standard_normal((30, 3)), xy)
+    keywords = {"method": "dlt", "sigma_xy": 0.5, "sigma_xyz": 0.003}
+    eleven = register(folder, points, **keywords)
+    twelve = register(folder, points, dlt_parameters=12, **keywords)
+    assert rejected(twelve) == rejected(eleven) == ["T04"]
+    assert np.allclose(twelve.view.core.centre, eleven.view.core.centre, atol=1e-7)
+    assert np.allclose(twelve.view.covariance.matrix, eleven.view.covariance.matrix, rtol=1e-5, atol=1e-15)
+    assert twelve.view.statistics["adjustment"]["points"] and "singular vector" in twelve.notes[0]
+    assert "adjusted" in twelve.notes[0] and "NOT" not in twelve.notes[0]
+
+
+def test_a_robust_loss_says_that_nothing_is_adjusted(folder, rng):
+    xyz, xy = places(rng, 20)
+    result = register(folder, control(xyz, xy), loss="huber", sigma_xy=0.5, sigma_xyz=0.003)
+    assert "adjustment" not in result.view.statistics
+    assert any("nothing is adjusted" in n and "take no part" in n for n in result.notes)
+    assert "nothing is adjusted" in result.text()

@@ -349,7 +349,7 @@ def _of_loss(loss: str, sigmas: PointSigmas) -> str:
     ignored = "; the stated sigmas in space take no part" if sigmas.space_known else ""
     return (
         f"robust loss {loss}: all points keep a part, coordinates in space are taken as exact{ignored}; nothing is "
-        "adjusted or tested point by point. Leave --loss out to have blunders named and photo and object adjusted together"
+        "adjusted or tested point by point. Leave --loss out to have blunders named, and photo and object adjusted"
     )
 
 

@@ -23,8 +23,6 @@ MOST_POINTS = 12_000_000
 DEPTH_JUMP = 0.02
 #: The share of intensity gradients that are drawn as edges.
 STRONGEST = 0.06
-#: Pixels between the points of a tangent: the depths' noise makes closer ones lean anyhow.
-ARM = 3
 #: As in colouring, unless told otherwise: the place where a colour is taken (px), and the cloud's own noise (m).
 SIGMA_IMAGE, SIGMA_XYZ = 0.3, 0.002
 
@@ -103,7 +101,7 @@ def surface_picture(cloud: PointCloud, view: View) -> SurfacePicture | None:
     edges = _depth_edges(depth) | _intensity_edges(sci)
     sigma = angle = None
     if view.covariance is not None:
-        sigma, angle = _sigma(view, small, depth)
+        sigma, angle = _sigma(cloud, view, small, depth)
     return SurfacePicture(edges, depth, sigma, angle)
 
 
@@ -149,27 +147,13 @@ def _intensity_edges(sci: SCI) -> npt.NDArray[np.bool_]:
     return np.asarray(ridge & (size > np.quantile(size[known], 1 - STRONGEST)))
 
 
-def _sigma(view: View, small: View, depth: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _sigma(cloud: PointCloud, view: View, small: View, depth: FloatArray) -> tuple[FloatArray, FloatArray]:
     height, width = depth.shape
     pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).reshape(-1, 2).astype(np.float64)
     places = _core.backproject(small.core, pixels, np.ascontiguousarray(depth.ravel()))
-    grid = places.reshape(height, width, 3)
-    # Tangents by the nearer of the two neighbours, so that no normal leans over a depth edge.
-    tangents = []
-    for axis in (0, 1):
-        g = np.moveaxis(grid, axis, 0)
-        step = np.full_like(g, np.nan)
-        step[:-ARM] = g[ARM:] - g[:-ARM]
-        back = np.full_like(g, np.nan)
-        back[ARM:] = step[:-ARM]
-        ahead, behind = np.linalg.norm(step, axis=2), np.linalg.norm(back, axis=2)
-        take = np.nan_to_num(ahead, nan=np.inf) <= np.nan_to_num(behind, nan=np.inf)
-        tangents.append(np.moveaxis(np.where(take[:, :, None], step, back), 0, axis))
-    normals = np.cross(tangents[0], tangents[1]).reshape(-1, 3)
-    centre = view.core.centre
     known = np.isfinite(places).all(1)
-    plain = known & ~(np.isfinite(normals).all(1) & (np.linalg.norm(np.nan_to_num(normals), axis=1) > 0))
-    normals[plain] = places[plain] - centre
+    buffer = _core.DepthBuffer(small.core)
+    buffer.add(cloud.xyz)
     assert view.covariance is not None
     surface = _core.SurfaceSigma(
         view.core, list(view.covariance.parameters), view.covariance.matrix,
@@ -177,7 +161,7 @@ def _sigma(view: View, small: View, depth: FloatArray) -> tuple[FloatArray, Floa
     )  # fmt: skip
     sigma, angle = np.full(len(places), np.nan), np.full(len(places), np.nan)
     chosen = np.ascontiguousarray(places[known])
-    sigma[known] = surface.at(chosen, normals=np.ascontiguousarray(normals[known]))
+    sigma[known] = surface.at(chosen, planes=buffer.finish().planes())
     # Across the ray, as if the surface faced the camera: an angle does not know slopes.
-    angle[known] = surface.at(chosen) / np.linalg.norm(chosen - centre, axis=1)
+    angle[known] = surface.at(chosen) / np.linalg.norm(chosen - view.core.centre, axis=1)
     return sigma.reshape(height, width), angle.reshape(height, width)

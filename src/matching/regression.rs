@@ -116,7 +116,7 @@ pub fn regress_patches(
     patches: &[&[i64]],
     options: &RegressionOptions,
 ) -> Result<Vec<Patch>> {
-    if xy.is_empty() || values.len() != xy.len() || design.len() % (2 * xy.len()) != 0 || design.is_empty() {
+    if xy.is_empty() || values.len() != xy.len() || !design.len().is_multiple_of(2 * xy.len()) || design.is_empty() {
         return Err(Error::invalid(format!(
             "{} places, {} intensities and {} derivatives do not go together",
             xy.len(),

@@ -20,6 +20,7 @@ pub mod geometry;
 pub mod icp;
 pub mod lzf;
 pub mod matching;
+mod memory;
 pub mod neighbours;
 pub mod records;
 pub mod render;

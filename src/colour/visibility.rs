@@ -66,7 +66,7 @@ impl VisibilityMap {
     pub fn new(buffer: DepthBuffer, footprint: &Footprint, limits: Limits) -> Result<Self> {
         let limits = limits.checked()?;
         let view = *buffer.view();
-        let surfaces = Surfaces::new(buffer, footprint);
+        let surfaces = Surfaces::new(buffer, footprint)?;
         Ok(Self {
             view,
             projector: BlockProjector::new(&view),

@@ -24,7 +24,7 @@ fn sci_front<'py>(
     max_gap: Option<f64>,
 ) -> PyResult<Front<'py>> {
     let footprint = if hide { Some(Footprint::new(tolerance, max_gap)?) } else { None };
-    let front = py.detach(|| sci::front(&buffer.0, footprint.as_ref()));
+    let front = py.detach(|| sci::front(&buffer.0, footprint.as_ref()))?;
     let shape = [front.height, front.width];
     Ok((owned(py, front.index, shape)?, owned(py, front.inverse_depth, shape)?, owned(py, front.limit, shape)?))
 }

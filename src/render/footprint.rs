@@ -14,12 +14,14 @@ use std::sync::Mutex;
 
 use rayon::prelude::*;
 
-use super::links::{Links, Patch, QUADRANTS, Surroundings};
+use super::links::{LANES, Links, Surroundings, filled};
+use super::marks::{Canvas, MAX_REACH, Marks, Rule};
 use super::pyramid::Pyramid;
 use super::sample::Sample;
 use super::zbuffer::{DepthBuffer, Grid};
 use crate::error::{Error, Result};
 use crate::geometry::View;
+use crate::memory::zeros;
 
 /// How surfaces are told from gaps, and how much in front "in front" is. The defaults were set on simulated scans, where
 /// they lose about one visible point in a hundred and pass one or two hidden ones.
@@ -66,8 +68,6 @@ impl Footprint {
     }
 }
 
-/// The farthest that a footprint reaches, rows.
-const MAX_REACH: usize = 64;
 /// How far the first look at the nearest cells goes, cells.
 const NEARBY: f32 = 3.0;
 /// Rows that one task looks after; it may write into half as many above and below.
@@ -85,24 +85,25 @@ pub struct Surfaces {
 
 impl Surfaces {
     /// From a depth buffer that everything was put into.
-    pub fn new(buffer: DepthBuffer, footprint: &Footprint) -> Self {
+    pub fn new(buffer: DepthBuffer, footprint: &Footprint) -> Result<Self> {
         let (view, grid) = (*buffer.view(), buffer.grid());
         Self::from_samples(&view, grid, buffer.into_samples(), footprint)
     }
 
     /// From the inverse depths in the cells of a grid, of points at the pixels' centres.
-    pub fn from_inverse_depth(view: &View, grid: Grid, inverse_depth: Vec<f32>, footprint: &Footprint) -> Self {
+    pub fn from_inverse_depth(view: &View, grid: Grid, inverse_depth: Vec<f32>, footprint: &Footprint) -> Result<Self> {
         let centred = |&v: &f32| if v > 0.0 { Sample::new(v, [0.5, 0.5]) } else { Sample::default() };
         Self::from_samples(view, grid, inverse_depth.par_iter().map(centred).collect(), footprint)
     }
 
-    fn from_samples(view: &View, grid: Grid, mut samples: Vec<Sample>, footprint: &Footprint) -> Self {
+    fn from_samples(view: &View, grid: Grid, mut samples: Vec<Sample>, footprint: &Footprint) -> Result<Self> {
         grid.wrap(&mut samples);
         let pixel_angle = pixel_angle(view);
         let ratios = [footprint.gap_ratio, footprint.row_ratio];
         let surroundings = Surroundings::new(grid, &samples, footprint.steepest, pixel_angle, ratios);
-        let rule = Rule { footprint: *footprint, pixel_angle, noise: surroundings.noise };
-        let mut limit = vec![0.0_f32; grid.len()];
+        let Footprint { tolerance, inner, .. } = *footprint;
+        let rule = Rule { tolerance, inner, pixel_angle, noise: surroundings.noise };
+        let mut limit = zeros(grid.len(), "the surfaces of a depth buffer")?;
         let first = in_bands(&grid, &mut limit, |_, rows, canvas| FirstLook::over(&surroundings, &rule, rows, canvas));
         let mut spacing = vec![0; grid.first_row() * grid.stride()];
         let mut open = Vec::new();
@@ -124,7 +125,7 @@ impl Surfaces {
                 let mut list = pending[band].lock().map(|mut list| std::mem::take(&mut *list)).unwrap_or_default();
                 for links in &mut list {
                     if let Some(patch) = surroundings.farther(links, &pyramid, &spacing, footprint.max_gap) {
-                        rule.cover(&grid, links.cell as usize, &patch, canvas);
+                        canvas.draw(&grid, links.cell as usize, &rule.mark(&patch));
                     }
                 }
                 list
@@ -133,8 +134,8 @@ impl Surfaces {
                 spacing[links.cell as usize] = surroundings.spacing_code(links);
             }
         }
-        let limit = closed(&grid, &limit);
-        Self { grid, samples, limit }
+        close(&grid, &mut limit);
+        Ok(Self { grid, samples, limit })
     }
 }
 
@@ -167,15 +168,27 @@ impl FirstLook {
         let stride = s.grid.stride();
         let start = rows.start * stride;
         let mut this = Self { spacing: vec![0; rows.len() * stride], open: Vec::new() };
+        let mut found = Vec::new();
         for y in rows {
-            for x in s.grid.used_columns() {
-                let cell = y * stride + x;
-                if s.samples[cell].found() {
-                    let (links, patch) = s.nearby(cell);
-                    rule.cover(&s.grid, cell, &patch, canvas);
-                    this.spacing[cell - start] = patch.spacing_code();
-                    if s.farthest(&patch) > NEARBY + 1.0 {
-                        this.open.push(links);
+            found.clear();
+            s.found(y, &mut found);
+            for cells in found.chunks(LANES) {
+                let all = filled(cells);
+                let nearby = s.nearby(&all);
+                let mut marks = Marks::new();
+                let (mut spacing, mut farthest) = ([0_u8; LANES], [0.0_f32; LANES]);
+                let samples = all.map(|cell| s.samples[cell as usize]);
+                for l in 0..LANES {
+                    let patch = s.patch_nearby(samples[l], &nearby, l);
+                    marks.set(l, &rule.mark(&patch));
+                    spacing[l] = patch.spacing_code();
+                    farthest[l] = s.farthest(&patch);
+                }
+                for (l, &cell) in cells.iter().enumerate() {
+                    canvas.draw(&s.grid, cell as usize, &marks.get(l));
+                    this.spacing[cell as usize - start] = spacing[l];
+                    if farthest[l] > NEARBY + 1.0 {
+                        this.open.push(s.links(cell, &nearby, l));
                     }
                 }
             }
@@ -187,25 +200,47 @@ impl FirstLook {
 /// Closes holes up to three cells wide, which the chance of where points fall leaves in a surface: where limits lie opposite
 /// each other in at least two of four directions, the lower of two opposite ones holds in between. Beyond a straight
 /// edge there are none, so that surfaces do not grow; and of a plane the lower is never in front.
-fn closed(grid: &Grid, limit: &[f32]) -> Vec<f32> {
-    let stride = grid.stride();
-    let mut closed = vec![0.0_f32; limit.len()];
-    closed.par_chunks_mut(stride).enumerate().skip(2).take(grid.rows() - 4).for_each(|(y, row)| {
-        let rows: [&[f32]; 5] = std::array::from_fn(|k| &limit[(y + k - 2) * stride..][..stride]);
-        #[cfg(target_arch = "x86_64")]
-        if std::arch::is_x86_feature_detected!("avx2") {
-            // SAFETY: the processor has the feature.
-            return unsafe { close_row_avx2(&rows, row) };
+fn close(grid: &Grid, limit: &mut [f32]) {
+    let (stride, rows) = (grid.stride(), grid.rows());
+    // Each band works from a copy of itself and of two rows on either side, which are taken before anything changes.
+    let bands = rows.div_ceil(CLOSED_ROWS);
+    let beside: Vec<[Vec<f32>; 2]> = (0..bands)
+        .map(|band| {
+            let (start, end) = (band * CLOSED_ROWS, ((band + 1) * CLOSED_ROWS).min(rows));
+            [start.saturating_sub(2)..start, end..(end + 2).min(rows)]
+                .map(|rows| limit[rows.start * stride..rows.end * stride].to_vec())
+        })
+        .collect();
+    limit.par_chunks_mut(CLOSED_ROWS * stride).zip(beside).enumerate().for_each(|(band, (cells, [above, below]))| {
+        let first = band * CLOSED_ROWS;
+        let before = above.len() / stride;
+        let copy = [&above, &*cells, &below].concat();
+        for (y, row) in cells.chunks_mut(stride).enumerate() {
+            // The outermost two rows belong to the rim.
+            if (2..rows - 2).contains(&(first + y)) {
+                let old = std::array::from_fn(|k| &copy[(before + y + k - 2) * stride..][..stride]);
+                close_row(&old, row);
+            }
         }
-        close_row(&rows, row);
     });
-    closed
+}
+
+/// Rows that are closed together.
+const CLOSED_ROWS: usize = 32;
+
+fn close_row(rows: &[&[f32]; 5], row: &mut [f32]) {
+    #[cfg(target_arch = "x86_64")]
+    if std::arch::is_x86_feature_detected!("avx2") {
+        // SAFETY: the processor has the feature.
+        return unsafe { close_row_avx2(rows, row) };
+    }
+    close_row_here(rows, row);
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
 unsafe fn close_row_avx2(rows: &[&[f32]; 5], row: &mut [f32]) {
-    close_row(rows, row);
+    close_row_here(rows, row);
 }
 
 #[inline(always)]
@@ -218,9 +253,9 @@ fn smaller(a: f32, b: f32) -> f32 {
     if a < b { a } else { b }
 }
 
-/// One row of [`closed`], from five rows of limits about it.
+/// One row, from five rows of limits about it.
 #[inline(always)]
-fn close_row(rows: &[&[f32]; 5], row: &mut [f32]) {
+fn close_row_here(rows: &[&[f32]; 5], row: &mut [f32]) {
     let n = row.len();
     // Of one length, so that nothing is left to check in the loop.
     let (r0, r1, r2, r3, r4) = (&rows[0][..n], &rows[1][..n], &rows[2][..n], &rows[3][..n], &rows[4][..n]);
@@ -237,12 +272,6 @@ fn close_row(rows: &[&[f32]; 5], row: &mut [f32]) {
 
 fn band_count(grid: &Grid) -> usize {
     (grid.rows() - 2 * grid.first_row()).div_ceil(BAND)
-}
-
-/// A part of the limits that one task may write into.
-struct Canvas<'a> {
-    first_row: usize,
-    cells: &'a mut [f32],
 }
 
 /// Runs `work(band, rows, canvas)` for bands of rows, all in parallel but no two neighbours at once, since each may write into
@@ -283,75 +312,5 @@ pub(crate) fn pixel_angle(view: &View) -> f32 {
     match (camera.unproject(&[x - 0.5, y]), camera.unproject(&[x + 0.5, y])) {
         (Some(a), Some(b)) => (a - b).norm() as f32,
         _ => fallback as f32,
-    }
-}
-
-struct Rule {
-    footprint: Footprint,
-    pixel_angle: f32,
-    /// Sigma of a depth, in the cloud's unit.
-    noise: f32,
-}
-
-/// How far beyond its last sample a surface reaches, as a part of the distance to the neighbour before it, and less by
-/// some of a pixel, so that bars of the width of a pixel do not grow.
-const OUTER: (f32, f32) = (0.9, 0.15);
-/// The least that a sample covers, cells.
-const LEAST: f32 = 0.1;
-
-impl Rule {
-    /// Draws what a sample covers.
-    #[inline(always)]
-    fn cover(&self, grid: &Grid, cell: usize, patch: &Patch, canvas: &mut Canvas<'_>) {
-        let Footprint { inner, tolerance, .. } = self.footprint;
-        let [gx, gy] = patch.gradient();
-        let own = patch.own + patch.lift([gx, gy]);
-        // Noise moves a point not only along the ray: across it, on a slope, it does as much.
-        let across = 0.5 + (1.5 * self.noise * own / self.pixel_angle).min(2.0);
-        let floor = tolerance.unwrap_or(1e-4 + 3.0 * self.noise * own) + 0.3 * self.pixel_angle;
-        let slack = own * floor + 0.25 * patch.misfit() + across * (gx.abs() + gy.abs());
-        let spacing = patch.spacing().unwrap_or(0.0);
-        let mut covered = [0.0_f32; QUADRANTS];
-        for (k, covered) in covered.iter_mut().enumerate() {
-            let (link, opposite) = (&patch.links[k], &patch.links[(k + 2) % QUADRANTS]);
-            let reach = match (link.found(), opposite.found()) {
-                (true, _) => inner * link.distance,
-                (false, true) => OUTER.0 * opposite.distance - OUTER.1,
-                (false, false) => OUTER.0 * spacing - OUTER.1,
-            };
-            *covered = reach.max(LEAST).min(MAX_REACH as f32 - 1.0);
-        }
-        let [east, south, west, north] = covered;
-        let stride = grid.stride();
-        let (column, row) = ((cell as u32 % stride as u32) as usize, (cell as u32 / stride as u32) as usize);
-        let [right, down] = patch.place;
-        let value = |dx: f32, dy: f32| {
-            let away = (dx * dx + dy * dy).sqrt();
-            own + gx * dx + gy * dy - slack - own * self.pixel_angle * away
-        };
-        // Cells are numbered from the sample's own; it is covered even where the sample lies in a corner of it.
-        let up = ((north - down) as usize).min(row - canvas.first_row) as isize;
-        let below =
-            ((south + down).max(0.0) as usize).min(canvas.first_row + canvas.cells.len() / stride - 1 - row) as isize;
-        let before = ((west - right) as usize).min(column) as isize;
-        let after = ((east + right).max(0.0) as usize).min(stride - 1 - column) as isize;
-        let (per_east, per_west) = (1.0 / east, 1.0 / west);
-        let (per_south, per_north) = (1.0 / south, 1.0 / north);
-        for j in -up..=below {
-            let dy = j as f32 - down;
-            let ry = dy * if dy > 0.0 { per_south } else { per_north };
-            let start = (row as isize + j - canvas.first_row as isize) * stride as isize + column as isize;
-            for i in -before..=after {
-                let dx = i as f32 - right;
-                let rx = dx * if dx > 0.0 { per_east } else { per_west };
-                if rx * rx + ry * ry <= 1.0 || (i, j) == (0, 0) {
-                    let limit = &mut canvas.cells[(start + i) as usize];
-                    let value = value(dx, dy);
-                    if value > *limit {
-                        *limit = value;
-                    }
-                }
-            }
-        }
     }
 }

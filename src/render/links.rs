@@ -1,15 +1,20 @@
 //! The neighbours of a sample on its own surface: the nearest in each of four quadrants (east, south, west, north of the
 //! diagonals), looked for ring by ring in the buffer and then, where they are farther away, in a pyramid whose cells
 //! hold the foremost sample below them.
+//!
+//! The first look, which every sample takes, goes over [`LANES`] samples at once, and what it makes of them has no branches,
+//! so that the compiler can use wide registers.
 
 use rayon::prelude::*;
 
 use super::pyramid::Pyramid;
 use super::sample::Sample;
-use super::zbuffer::Grid;
+use super::zbuffer::{Grid, PAD};
 
 /// East, south, west, north.
 pub(super) const QUADRANTS: usize = 4;
+/// Samples that are looked at together.
+pub(super) const LANES: usize = 8;
 /// By how much two depths of one surface may differ beside what their distance makes, relative.
 const TOLERANCE: f32 = 0.001;
 /// The tangent of an incidence that is nothing special.
@@ -48,6 +53,13 @@ impl Link {
     fn slope(&self) -> f32 {
         self.rise / self.distance
     }
+
+    /// Itself, or none.
+    #[inline(always)]
+    fn unless(&self, dropped: bool) -> Self {
+        let kept = |v: f32| if dropped { 0.0 } else { v };
+        Self { dx: kept(self.dx), dy: kept(self.dy), rise: kept(self.rise), distance: kept(self.distance) }
+    }
 }
 
 /// What the neighbours say of the surface at a sample.
@@ -61,33 +73,32 @@ pub(super) struct Patch {
 }
 
 impl Patch {
-    /// The distance of the second nearest neighbour: two are needed to call it a surface.
+    /// The distance of the second nearest neighbour: two are needed to call it a surface. Infinite without.
     #[inline(always)]
-    pub fn spacing(&self) -> Option<f32> {
+    pub fn spacing(&self) -> f32 {
         let (mut first, mut second) = (f32::INFINITY, f32::INFINITY);
-        for link in self.links.iter().filter(|link| link.found()) {
-            let d = link.distance;
-            if d < first {
-                (first, second) = (d, first);
-            } else if d < second {
-                second = d;
-            }
+        for link in &self.links {
+            let d = if link.found() { link.distance } else { f32::INFINITY };
+            second = smaller(second, larger(first, d));
+            first = smaller(first, d);
         }
-        (second < f32::INFINITY).then_some(second)
+        second
     }
 
     /// The spacing in quarters of a pixel; 0 for unknown.
     #[inline(always)]
     pub fn spacing_code(&self) -> u8 {
-        self.spacing().map_or(0, |s| (4.0 * s + 1.0) as u8)
+        let spacing = self.spacing();
+        if spacing < f32::INFINITY { (4.0 * spacing + 1.0) as u8 } else { 0 }
     }
 
     /// The plane through the sample that fits the neighbours best: the change of the inverse depth by one cell.
     #[inline(always)]
     pub fn gradient(&self) -> [f32; 2] {
         let (mut xx, mut xy, mut yy, mut xr, mut yr) = (0.0_f32, 0.0, 0.0, 0.0, 0.0);
-        for link in self.links.iter().filter(|link| link.found()) {
-            let w = 1.0 / (link.distance * link.distance);
+        for link in &self.links {
+            // One that is not there has zeros everywhere.
+            let w = if link.found() { 1.0 / (link.distance * link.distance) } else { 0.0 };
             xx += w * link.dx * link.dx;
             xy += w * link.dx * link.dy;
             yy += w * link.dy * link.dy;
@@ -104,9 +115,9 @@ impl Patch {
     #[inline(always)]
     pub fn lift(&self, [gx, gy]: [f32; 2]) -> f32 {
         let (mut sum, mut n) = (0.0, 1.0);
-        for link in self.links.iter().filter(|link| link.found()) {
+        for link in &self.links {
             sum += link.rise - gx * link.dx - gy * link.dy;
-            n += 1.0;
+            n += if link.found() { 1.0 } else { 0.0 };
         }
         sum / n
     }
@@ -114,19 +125,24 @@ impl Patch {
     /// How far the sample lies off the line between two opposite neighbours; the sum for both pairs.
     #[inline(always)]
     pub fn misfit(&self) -> f32 {
-        (0..2).filter_map(|k| self.off_line(k)).map(|(off, _)| off.abs()).sum()
+        let off = |k| if self.between(k) { self.off_line(k).0.abs() } else { 0.0 };
+        off(0) + off(1)
+    }
+
+    /// Whether there are neighbours in quadrants `k` and `k + 2`.
+    #[inline(always)]
+    fn between(&self, k: usize) -> bool {
+        self.links[k].found() & self.links[k + 2].found()
     }
 
     /// The sample's inverse depth against the line between the neighbours of quadrants `k` and `k + 2`; and by how much
     /// its sigma exceeds that of one depth.
     #[inline(always)]
-    fn off_line(&self, k: usize) -> Option<(f32, f32)> {
+    fn off_line(&self, k: usize) -> (f32, f32) {
         let (a, b) = (self.links[k], self.links[k + 2]);
-        (a.found() && b.found()).then(|| {
-            let all = a.distance + b.distance;
-            let (wa, wb) = (b.distance / all, a.distance / all);
-            (wa * a.rise + wb * b.rise, (1.0 + wa * wa + wb * wb).sqrt())
-        })
+        let all = a.distance + b.distance;
+        let (wa, wb) = (b.distance / all, a.distance / all);
+        (wa * a.rise + wb * b.rise, (1.0 + wa * wa + wb * wb).sqrt())
     }
 
     /// Drops what does not belong: of two opposite neighbours that are not on one line with the sample the steeper when
@@ -135,26 +151,20 @@ impl Patch {
     fn prune(&mut self, s: &Surroundings<'_>) {
         for k in 0..2 {
             let (a, b) = (self.links[k], self.links[k + 2]);
-            if a.found() && b.found() {
-                let near = a.distance.min(b.distance);
-                let (sa, sb) = (a.slope().abs(), b.slope().abs());
-                let bend = (a.slope() + b.slope()).abs() * near;
-                let allowed = self.own * (5.0 * s.noise * self.own + s.usual * near) + 0.5 * near * sa.min(sb);
-                if bend > allowed && sa.max(sb) > self.own * s.usual {
-                    self.links[if sa > sb { k } else { k + 2 }] = Link::default();
-                }
-            }
+            let near = smaller(a.distance, b.distance);
+            let (sa, sb) = (a.slope().abs(), b.slope().abs());
+            let bend = (a.slope() + b.slope()).abs() * near;
+            let allowed = self.own * (5.0 * s.noise * self.own + s.usual * near) + 0.5 * near * smaller(sa, sb);
+            let bent = self.between(k) & (bend > allowed) & (larger(sa, sb) > self.own * s.usual);
+            self.links[k] = a.unless(bent & (sa > sb));
+            self.links[k + 2] = b.unless(bent & !(sa > sb));
         }
-        if let Some(spacing) = self.spacing() {
-            let before = self.links;
-            for (k, link) in self.links.iter_mut().enumerate() {
-                let opposite = before[(k + 2) % QUADRANTS].distance;
-                // A scan at a grazing angle has rows far apart, but on both sides; a bar has a gap on one.
-                let ratio = if 2.0 * opposite > link.distance { s.row_ratio } else { s.gap_ratio };
-                if link.distance > ratio * spacing {
-                    *link = Link::default();
-                }
-            }
+        let (before, spacing) = (self.links, self.spacing());
+        for (k, link) in self.links.iter_mut().enumerate() {
+            let opposite = before[(k + 2) % QUADRANTS].distance;
+            // A scan at a grazing angle has rows far apart, but on both sides; a bar has a gap on one.
+            let ratio = if 2.0 * opposite > link.distance { s.row_ratio } else { s.gap_ratio };
+            *link = link.unless(link.distance > ratio * spacing);
         }
     }
 }
@@ -178,12 +188,23 @@ pub(super) struct Surroundings<'a> {
     rings: [[Probe; RING]; QUADRANTS],
 }
 
+/// The neighbours of [`LANES`] samples in the cells about them: zeros for none.
+#[repr(align(32))]
+pub(super) struct Nearby {
+    other: [[u32; LANES]; QUADRANTS],
+    /// Cells to the right.
+    dx: [[f32; LANES]; QUADRANTS],
+    /// Cells down.
+    dy: [[f32; LANES]; QUADRANTS],
+}
+
 /// Where to look for a neighbour.
 #[derive(Debug, Clone, Copy)]
 struct Probe {
     /// Cells in the buffer.
     step: isize,
-    offset: (i8, i8),
+    dx: f32,
+    dy: f32,
     /// By how much its inverse depth may differ, relative.
     allowed: f32,
 }
@@ -191,6 +212,17 @@ struct Probe {
 #[inline(always)]
 fn larger(a: f32, b: f32) -> f32 {
     if a > b { a } else { b }
+}
+
+#[inline(always)]
+fn smaller(a: f32, b: f32) -> f32 {
+    if a < b { a } else { b }
+}
+
+/// Up to [`LANES`] cells, the last one repeated.
+#[inline(always)]
+pub(super) fn filled(cells: &[u32]) -> [u32; LANES] {
+    std::array::from_fn(|l| cells[l.min(cells.len() - 1)])
 }
 
 /// The quadrant of an offset.
@@ -229,7 +261,7 @@ impl<'a> Surroundings<'a> {
                 let (dx, dy) = turned(offset, k);
                 let distance = ((dx * dx + dy * dy) as f32).sqrt();
                 let allowed = tolerance + steepest * distance;
-                Probe { step: dy * stride + dx, offset: (dx as i8, dy as i8), allowed }
+                Probe { step: dy * stride + dx, dx: dx as f32, dy: dy as f32, allowed }
             })
         });
         let [gap_ratio, row_ratio] = ratios;
@@ -245,9 +277,9 @@ impl<'a> Surroundings<'a> {
     }
 
     #[inline(always)]
-    fn link(&self, own: f32, place: [f32; 2], other: Sample, (dx, dy): (i8, i8)) -> Link {
+    fn link(&self, own: f32, place: [f32; 2], other: Sample, dx: f32, dy: f32) -> Link {
         let [right, down] = other.place();
-        let (dx, dy) = (f32::from(dx) + right - place[0], f32::from(dy) + down - place[1]);
+        let (dx, dy) = (dx + right - place[0], dy + down - place[1]);
         // Two samples in neighbouring cells may lie closer together than the positions tell.
         let distance = larger((dx * dx + dy * dy).sqrt(), 0.25);
         Link { dx, dy, rise: other.inverse_depth() - own, distance }
@@ -263,7 +295,7 @@ impl<'a> Surroundings<'a> {
         for (found, &near) in found.iter_mut().zip(&links.near) {
             if near != NONE {
                 let at = links.cell as isize + isize::from(near.1) * stride + isize::from(near.0);
-                *found = self.link(own, place, self.samples[at as usize], near);
+                *found = self.link(own, place, self.samples[at as usize], f32::from(near.0), f32::from(near.1));
             }
         }
         Patch { own, place, links: found }
@@ -281,25 +313,77 @@ impl<'a> Surroundings<'a> {
         patch
     }
 
-    /// Looks at the nearest cells.
+    /// The cells of a row that hold a sample, appended.
     #[inline(always)]
-    pub fn nearby(&self, cell: usize) -> (Links, Patch) {
-        let own = self.samples[cell].inverse_depth();
-        let mut links = Links { cell: cell as u32, near: [NONE; QUADRANTS] };
-        for (near, ring) in links.near.iter_mut().zip(&self.rings) {
+    pub fn found(&self, row: usize, cells: &mut Vec<u32>) {
+        let (start, columns) = (row * self.grid.stride(), self.grid.used_columns());
+        let first = cells.len();
+        cells.resize(first + columns.len(), 0);
+        let mut n = first;
+        for x in columns {
+            // Written always and counted when found: whether a cell is empty cannot be foreseen.
+            cells[n] = (start + x) as u32;
+            n += usize::from(self.samples[start + x].found());
+        }
+        cells.truncate(n);
+    }
+
+    /// Looks at the nearest cells about samples, which lie at least three from the rim.
+    #[inline(always)]
+    pub fn nearby(&self, cells: &[u32; LANES]) -> Nearby {
+        let rim = PAD * (self.grid.stride() + 1);
+        assert!(cells.iter().all(|&cell| (rim..self.samples.len() - rim).contains(&(cell as usize))));
+        let own = cells.map(|cell| self.samples[cell as usize].inverse_depth());
+        let none = [[0.0; LANES]; QUADRANTS];
+        let mut nearby = Nearby { other: [[0; LANES]; QUADRANTS], dx: none, dy: none };
+        for (k, ring) in self.rings.iter().enumerate() {
+            let (mut best, mut dx, mut dy) = ([0_u32; LANES], [0.0_f32; LANES], [0.0_f32; LANES]);
             for probe in ring {
-                let other = self.samples[(cell as isize + probe.step) as usize];
-                if other.found() {
-                    let v = other.inverse_depth();
-                    if (v - own).abs() <= larger(own, v) * probe.allowed {
-                        *near = probe.offset;
-                        break;
-                    }
+                let mut other = [Sample::default(); LANES];
+                for l in 0..LANES {
+                    // SAFETY: no step is longer than the rim's width, and all cells are farther from the ends than that.
+                    other[l] = unsafe { *self.samples.get_unchecked((cells[l] as isize + probe.step) as usize) };
+                }
+                let mut missing = 0_u32;
+                for l in 0..LANES {
+                    let v = other[l].inverse_depth();
+                    let one_surface = (v - own[l]).abs() <= larger(own[l], v) * probe.allowed;
+                    let taken = other[l].found() & one_surface & (best[l] == 0);
+                    best[l] = if taken { other[l].0 } else { best[l] };
+                    dx[l] = if taken { probe.dx } else { dx[l] };
+                    dy[l] = if taken { probe.dy } else { dy[l] };
+                    missing |= u32::from(best[l] == 0);
+                }
+                if missing == 0 {
+                    break;
                 }
             }
+            (nearby.other[k], nearby.dx[k], nearby.dy[k]) = (best, dx, dy);
         }
-        let patch = self.pruned(&mut links);
-        (links, patch)
+        nearby
+    }
+
+    /// The surface at one of the samples, from the nearest cells.
+    #[inline(always)]
+    pub fn patch_nearby(&self, sample: Sample, nearby: &Nearby, lane: usize) -> Patch {
+        let (own, place) = (sample.inverse_depth(), sample.place());
+        let mut links = [Link::default(); QUADRANTS];
+        for k in 0..QUADRANTS {
+            let other = Sample(nearby.other[k][lane]);
+            let link = self.link(own, place, other, nearby.dx[k][lane], nearby.dy[k][lane]);
+            links[k] = link.unless(!other.found());
+        }
+        let mut patch = Patch { own, place, links };
+        patch.prune(self);
+        patch
+    }
+
+    /// A sample whose surface the nearest cells do not end, for looking farther.
+    #[inline(always)]
+    pub fn links(&self, cell: u32, nearby: &Nearby, lane: usize) -> Links {
+        let patch = self.patch_nearby(self.samples[cell as usize], nearby, lane);
+        let near = |k: usize| (nearby.dx[k][lane] as i8, nearby.dy[k][lane] as i8);
+        Links { cell, near: std::array::from_fn(|k| if patch.links[k].found() { near(k) } else { NONE }) }
     }
 
     /// Whether looking farther than `reach` makes sense.
@@ -310,13 +394,12 @@ impl<'a> Surroundings<'a> {
     /// How far away a neighbour may lie that a patch still misses: what is farther would be pruned.
     #[inline(always)]
     pub fn farthest(&self, patch: &Patch) -> f32 {
-        let Some(spacing) = patch.spacing() else { return f32::INFINITY };
+        let spacing = patch.spacing();
         let mut farthest = 0.0;
         for (k, link) in patch.links.iter().enumerate() {
-            if !link.found() {
-                let rows = (2.0 * patch.links[(k + 2) % QUADRANTS].distance).min(self.row_ratio * spacing);
-                farthest = larger(farthest, larger(rows, self.gap_ratio * spacing));
-            }
+            let rows = smaller(2.0 * patch.links[(k + 2) % QUADRANTS].distance, self.row_ratio * spacing);
+            let reach = larger(rows, self.gap_ratio * spacing);
+            farthest = if link.found() { farthest } else { larger(farthest, reach) };
         }
         farthest
     }
@@ -331,16 +414,23 @@ impl<'a> Surroundings<'a> {
     pub fn depth_noise(&self) -> f32 {
         let rows: Vec<usize> =
             (self.grid.first_row()..self.grid.rows() - self.grid.first_row()).step_by(EVERY).collect();
-        let mut off: Vec<f32> = rows
-            .into_par_iter()
-            .flat_map_iter(|y| self.grid.used_columns().map(move |x| y * self.grid.stride() + x))
-            .filter(|&cell| self.samples[cell].found())
-            .flat_map_iter(|cell| {
-                let patch = self.nearby(cell).1;
-                let share = move |(off, share): (f32, f32)| off.abs() / (share * patch.own * patch.own);
-                (0..2).filter_map(move |k| patch.off_line(k)).map(share)
-            })
-            .collect();
+        let of_row = |y: usize| {
+            let mut off = Vec::new();
+            let mut found = Vec::new();
+            self.found(y, &mut found);
+            for cells in found.chunks(LANES) {
+                let nearby = self.nearby(&filled(cells));
+                for (l, &cell) in cells.iter().enumerate() {
+                    let patch = self.patch_nearby(self.samples[cell as usize], &nearby, l);
+                    for k in (0..2).filter(|&k| patch.between(k)) {
+                        let (by, share) = patch.off_line(k);
+                        off.push(by.abs() / (share * patch.own * patch.own));
+                    }
+                }
+            }
+            off
+        };
+        let mut off: Vec<f32> = rows.into_par_iter().flat_map_iter(of_row).collect();
         if off.len() < 100 {
             return 0.0;
         }

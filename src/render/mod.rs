@@ -8,6 +8,7 @@ pub mod intensity;
 mod links;
 mod plane_fit;
 mod planes;
+mod marks;
 mod pyramid;
 pub mod resampling;
 mod sample;

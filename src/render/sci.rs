@@ -33,14 +33,15 @@ pub struct Front {
 }
 
 /// The points that no surface hides. Without a footprint every pixel keeps its nearest point.
-pub fn front(buffer: &IndexBuffer, footprint: Option<&Footprint>) -> Front {
+pub fn front(buffer: &IndexBuffer, footprint: Option<&Footprint>) -> Result<Front> {
     let grid = buffer.grid();
     let (width, height) = (grid.width, grid.height);
     let mut index = vec![EMPTY; width * height];
     let mut inverse_depth = vec![0.0f32; width * height];
     let mut limit = vec![0.0f32; width * height];
-    let surfaces =
-        footprint.map(|footprint| Surfaces::from_inverse_depth(buffer.view(), grid, buffer.inverse_depth(), footprint));
+    let surfaces = footprint
+        .map(|footprint| Surfaces::from_inverse_depth(buffer.view(), grid, buffer.inverse_depth(), footprint))
+        .transpose()?;
     index
         .par_chunks_mut(width)
         .zip(inverse_depth.par_chunks_mut(width))
@@ -57,7 +58,7 @@ pub fn front(buffer: &IndexBuffer, footprint: Option<&Footprint>) -> Front {
                 }
             }
         });
-    Front { width, height, index, inverse_depth, limit }
+    Ok(Front { width, height, index, inverse_depth, limit })
 }
 
 /// A cloud, or a chunk of it.
@@ -174,7 +175,7 @@ mod tests {
         for (k, chunk) in xyz.chunks(size).enumerate() {
             buffer.add(chunk, (k * size) as u64).unwrap();
         }
-        let front = front(&buffer, footprint);
+        let front = front(&buffer, footprint).unwrap();
         let n = front.index.len();
         let (mut offset, mut range) = (vec![[f32::NAN; 2]; n], vec![f32::NAN; n]);
         let (mut intensity, mut cosine) = (vec![f32::NAN; n], vec![f32::NAN; n]);

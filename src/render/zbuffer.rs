@@ -12,6 +12,7 @@ use rayon::prelude::*;
 use super::sample::Sample;
 use crate::error::{Error, Result};
 use crate::geometry::{Block, BlockProjector, Frustum, LANES, Model, View};
+use crate::memory::zeros;
 
 /// Points per task of the scheduler.
 const TASK: usize = 16 * LANES;
@@ -243,31 +244,6 @@ fn scatter(view: &View, grid: &Grid, xyz: &[[f64; 3]], put: impl Fn(&Located, st
     });
 }
 
-/// A cell that is empty when all its bits are zero.
-///
-/// # Safety
-/// All bits zero has to be a valid value.
-unsafe trait Zeroed {}
-// SAFETY: they are integers.
-unsafe impl Zeroed for AtomicU32 {}
-// SAFETY: they are integers.
-unsafe impl Zeroed for AtomicU64 {}
-
-/// Empty cells. The system hands out zeros, so that nothing is touched before it is needed, and then by all threads.
-fn empty_cells<T: Zeroed>(n: usize) -> Result<Vec<T>> {
-    let refused =
-        || Error::invalid(format!("there is no memory for a depth buffer of {} MB", n * size_of::<T>() / 1_000_000));
-    let layout = std::alloc::Layout::array::<T>(n).map_err(|_| refused())?;
-    if layout.size() == 0 {
-        return Ok(Vec::new());
-    }
-    // SAFETY: the layout is not empty; the memory is of the global allocator, of this layout, and zeros are valid.
-    unsafe {
-        let memory = std::alloc::alloc_zeroed(layout).cast::<T>();
-        if memory.is_null() { Err(refused()) } else { Ok(Vec::from_raw_parts(memory, n, n)) }
-    }
-}
-
 /// The nearest depth in each pixel.
 pub struct DepthBuffer {
     view: View,
@@ -280,7 +256,7 @@ impl DepthBuffer {
     /// An empty buffer.
     pub fn new(view: View) -> Result<Self> {
         let grid = Grid::new(&view)?;
-        let cells = empty_cells(grid.len())?;
+        let cells = zeros(grid.len(), "a depth buffer")?;
         Ok(Self { view, grid, cells })
     }
 
@@ -328,7 +304,7 @@ impl IndexBuffer {
     /// An empty buffer.
     pub fn new(view: View) -> Result<Self> {
         let grid = Grid::new(&view)?;
-        let cells = empty_cells(grid.len())?;
+        let cells = zeros(grid.len(), "a depth buffer")?;
         Ok(Self { view, grid, cells })
     }
 

@@ -1,0 +1,67 @@
+//! Large, empty memory: zeros from the system, which nothing touches before it is needed, in large pages where the system
+//! has them. With small ones, buffers of a hundred megabytes that are hit at random spend their time on finding pages.
+
+use std::sync::atomic::{AtomicU32, AtomicU64};
+
+use crate::error::{Error, Result};
+
+/// A value whose bits may all be zero.
+///
+/// # Safety
+/// All bits zero has to be a valid value.
+pub(crate) unsafe trait Zeroed {}
+// SAFETY: all bits zero is the number 0.
+unsafe impl Zeroed for AtomicU32 {}
+// SAFETY: all bits zero is the number 0.
+unsafe impl Zeroed for AtomicU64 {}
+// SAFETY: all bits zero is the number 0.
+unsafe impl Zeroed for f32 {}
+
+/// `n` zeros for `what`; refused where there is no memory.
+pub(crate) fn zeros<T: Zeroed>(n: usize, what: &str) -> Result<Vec<T>> {
+    let refused = || Error::invalid(format!("there is no memory for {what} of {} MB", n * size_of::<T>() / 1_000_000));
+    let layout = std::alloc::Layout::array::<T>(n).map_err(|_| refused())?;
+    if layout.size() == 0 {
+        return Ok(Vec::new());
+    }
+    // SAFETY: the layout is not empty; the memory is of the global allocator, of this layout, and zeros are valid.
+    unsafe {
+        let memory = std::alloc::alloc_zeroed(layout).cast::<T>();
+        if memory.is_null() {
+            return Err(refused());
+        }
+        prefer_large_pages(memory.cast(), layout.size());
+        Ok(Vec::from_raw_parts(memory, n, n))
+    }
+}
+
+/// Asks for large pages for untouched memory. Advice: if it is not taken, nothing is lost.
+#[cfg(target_os = "linux")]
+fn prefer_large_pages(memory: *mut u8, size: usize) {
+    const PAGE: usize = 4096;
+    /// Below this there is nothing to win.
+    const LARGE: usize = 4 << 20;
+    if size >= LARGE {
+        let before = memory.align_offset(PAGE);
+        // SAFETY: the range lies within one allocation, and the advice changes none of its contents.
+        unsafe { libc::madvise(memory.add(before).cast(), (size - before) / PAGE * PAGE, libc::MADV_HUGEPAGE) };
+    }
+}
+
+#[cfg(not(target_os = "linux"))]
+fn prefer_large_pages(_memory: *mut u8, _size: usize) {}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn gives_zeros_of_any_size_and_refuses_what_no_machine_has() {
+        for n in [0, 1, 1000, 3 << 20] {
+            let zeros = zeros::<f32>(n, "a test").unwrap();
+            assert!(zeros.len() == n && zeros.iter().all(|&v| v == 0.0), "{n}");
+        }
+        let error = zeros::<AtomicU64>(1 << 55, "a test").unwrap_err().to_string();
+        assert!(error.starts_with("there is no memory for a test of "), "{error}");
+    }
+}

@@ -1,0 +1,179 @@
+//! What one sample of a depth buffer covers: a quarter of an ellipse in each of four quadrants, on the plane through the
+//! sample and its neighbours.
+
+use super::links::{LANES, Patch, QUADRANTS};
+use super::zbuffer::Grid;
+
+/// The farthest that a mark reaches, rows.
+pub(super) const MAX_REACH: usize = 64;
+/// How far beyond its last sample a surface reaches, as a part of the distance to the neighbour before it, and less by
+/// some of a pixel, so that bars of the width of a pixel do not grow.
+const OUTER: (f32, f32) = (0.9, 0.15);
+/// The least that a sample covers, cells.
+const LEAST: f32 = 0.1;
+
+/// How a surface becomes a mark.
+pub(super) struct Rule {
+    /// What is in front by less than this part of the depth hides nothing; `None` for what the noise suggests.
+    pub tolerance: Option<f32>,
+    /// How far a sample covers towards a neighbour, as a part of the distance to it.
+    pub inner: f32,
+    /// Radians that a cell spans.
+    pub pixel_angle: f32,
+    /// Sigma of a depth, in the cloud's unit.
+    pub noise: f32,
+}
+
+/// What a sample covers, and how near that is.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Mark {
+    /// Where the sample lies against its cell's centre, right and down.
+    place: [f32; 2],
+    /// Inverse depth of the surface at the sample.
+    own: f32,
+    /// Its change by one cell, right and down.
+    gradient: [f32; 2],
+    /// By how much something has to be behind it to be hidden.
+    slack: f32,
+    /// How much more for each cell of distance.
+    fading: f32,
+    /// Cells to the east, south, west and north.
+    covered: [f32; QUADRANTS],
+}
+
+impl Rule {
+    /// What a sample covers.
+    #[inline(always)]
+    pub fn mark(&self, patch: &Patch) -> Mark {
+        let [gx, gy] = patch.gradient();
+        let own = patch.own + patch.lift([gx, gy]);
+        // Noise moves a point not only along the ray: across it, on a slope, it does as much.
+        let across = 0.5 + smaller(1.5 * self.noise * own / self.pixel_angle, 2.0);
+        let floor = self.tolerance.unwrap_or(1e-4 + 3.0 * self.noise * own) + 0.3 * self.pixel_angle;
+        let slack = own * floor + 0.25 * patch.misfit() + across * (gx.abs() + gy.abs());
+        let spacing = patch.spacing();
+        let spacing = if spacing < f32::INFINITY { spacing } else { 0.0 };
+        let mut covered = [0.0_f32; QUADRANTS];
+        for (k, covered) in covered.iter_mut().enumerate() {
+            let (link, opposite) = (&patch.links[k], &patch.links[(k + 2) % QUADRANTS]);
+            let end = OUTER.0 * (if opposite.found() { opposite.distance } else { spacing }) - OUTER.1;
+            let reach = if link.found() { self.inner * link.distance } else { end };
+            *covered = smaller(larger(reach, LEAST), MAX_REACH as f32 - 1.0);
+        }
+        Mark { place: patch.place, own, gradient: [gx, gy], slack, fading: own * self.pixel_angle, covered }
+    }
+}
+
+/// Marks side by side, as wide registers leave them.
+#[repr(align(32))]
+pub(super) struct Marks {
+    numbers: [[f32; LANES]; NUMBERS],
+}
+
+/// Numbers in a mark.
+const NUMBERS: usize = 7 + QUADRANTS;
+
+impl Marks {
+    /// Room for them.
+    pub fn new() -> Self {
+        Self { numbers: [[0.0; LANES]; NUMBERS] }
+    }
+
+    /// Keeps one.
+    #[inline(always)]
+    pub fn set(&mut self, lane: usize, mark: &Mark) {
+        let Mark { place: [right, down], own, gradient: [gx, gy], slack, fading, covered: [east, south, west, north] } =
+            *mark;
+        let numbers = [right, down, own, gx, gy, slack, fading, east, south, west, north];
+        for (kept, number) in self.numbers.iter_mut().zip(numbers) {
+            kept[lane] = number;
+        }
+    }
+
+    /// Gives one back.
+    #[inline(always)]
+    pub fn get(&self, lane: usize) -> Mark {
+        let [right, down, own, gx, gy, slack, fading, east, south, west, north] =
+            std::array::from_fn(|k| self.numbers[k][lane]);
+        Mark { place: [right, down], own, gradient: [gx, gy], slack, fading, covered: [east, south, west, north] }
+    }
+}
+
+/// A part of the limits that one task may write into.
+pub(super) struct Canvas<'a> {
+    /// The grid's row that it begins with.
+    pub first_row: usize,
+    /// Whole rows.
+    pub cells: &'a mut [f32],
+}
+
+impl Canvas<'_> {
+    /// Draws what the sample in a cell covers, where nothing nearer is drawn.
+    #[inline(always)]
+    pub fn draw(&mut self, grid: &Grid, cell: usize, mark: &Mark) {
+        let stride = grid.stride();
+        let (column, row) = ((cell as u32 % stride as u32) as usize, (cell as u32 / stride as u32) as usize);
+        let ([right, down], [east, south, west, north]) = (mark.place, mark.covered);
+        // Cells are numbered from the sample's own.
+        let up = ((north - down) as usize).min(row - self.first_row) as isize;
+        let below =
+            ((south + down).max(0.0) as usize).min(self.first_row + self.cells.len() / stride - 1 - row) as isize;
+        let before = ((west - right) as usize).min(column);
+        let after = ((east + right).max(0.0) as usize).min(stride - 1 - column);
+        let home = (row - self.first_row) * stride + column;
+        let (per_east, per_west) = (1.0 / east, 1.0 / west);
+        let (per_south, per_north) = (1.0 / south, 1.0 / north);
+        let mut first = 0;
+        while first <= before + after {
+            // Cells side by side: how far right, by the sample's own measure, and what of the plane does not change
+            // from row to row. Beyond the last one everything is infinitely far.
+            let (mut dx2, mut rx2, mut value) = ([0.0_f32; LANES], [0.0_f32; LANES], [0.0_f32; LANES]);
+            for l in 0..LANES {
+                let dx = ((first + l) as i32 - before as i32) as f32 - right;
+                let rx = dx * if dx > 0.0 { per_east } else { per_west };
+                dx2[l] = dx * dx;
+                rx2[l] = if first + l <= before + after { rx * rx } else { f32::INFINITY };
+                value[l] = mark.own + mark.gradient[0] * dx;
+            }
+            for j in -up..=below {
+                let dy = j as f32 - down;
+                let ry = dy * if dy > 0.0 { per_south } else { per_north };
+                let (dy2, ry2, rise) = (dy * dy, ry * ry, mark.gradient[1] * dy);
+                let start = (home as isize + j * stride as isize) as usize + first - before;
+                let paint = |l: usize, limit: f32| {
+                    let value = value[l] + rise - mark.slack - mark.fading * (dx2[l] + dy2).sqrt();
+                    // Not by comparing: a store that depends on it is slow.
+                    limit.max(if rx2[l] + ry2 <= 1.0 { value } else { 0.0 })
+                };
+                let cells = &mut self.cells[start..];
+                // Plain loops: closures given to iterators are not compiled for the wide registers.
+                if let Some(cells) = cells.first_chunk_mut::<LANES>() {
+                    for l in 0..LANES {
+                        cells[l] = paint(l, cells[l]);
+                    }
+                } else {
+                    for l in 0..cells.len() {
+                        cells[l] = paint(l, cells[l]);
+                    }
+                }
+            }
+            first += LANES;
+        }
+        // Its own cell is covered even where the sample lies in a corner of it.
+        let (dx, dy) = (-right, -down);
+        let value = mark.own + mark.gradient[0] * dx + mark.gradient[1] * dy
+            - mark.slack
+            - mark.fading * (dx * dx + dy * dy).sqrt();
+        self.cells[home] = larger(value, self.cells[home]);
+    }
+}
+
+#[inline(always)]
+fn larger(a: f32, b: f32) -> f32 {
+    if a > b { a } else { b }
+}
+
+#[inline(always)]
+fn smaller(a: f32, b: f32) -> f32 {
+    if a < b { a } else { b }
+}

@@ -125,7 +125,7 @@ impl Surfaces {
                 let mut list = pending[band].lock().map(|mut list| std::mem::take(&mut *list)).unwrap_or_default();
                 for links in &mut list {
                     if let Some(patch) = surroundings.farther(links, &pyramid, &spacing, footprint.max_gap) {
-                        canvas.draw(&grid, links.cell as usize, &rule.mark(&patch));
+                        canvas.draw(&grid, grid.row_and_column(links.cell), &rule.mark(&patch));
                     }
                 }
                 list
@@ -185,7 +185,7 @@ impl FirstLook {
                     farthest[l] = s.farthest(&patch);
                 }
                 for (l, &cell) in cells.iter().enumerate() {
-                    canvas.draw(&s.grid, cell as usize, &marks.get(l));
+                    canvas.draw(&s.grid, [y, cell as usize - y * stride], &marks.get(l));
                     this.spacing[cell as usize - start] = spacing[l];
                     if farthest[l] > NEARBY + 1.0 {
                         this.open.push(s.links(cell, &nearby, l));

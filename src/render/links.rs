@@ -189,6 +189,7 @@ pub(super) struct Surroundings<'a> {
 }
 
 /// The neighbours of [`LANES`] samples in the cells about them: zeros for none.
+#[derive(Debug, Clone, Default, PartialEq)]
 #[repr(align(32))]
 pub(super) struct Nearby {
     other: [[u32; LANES]; QUADRANTS],
@@ -202,7 +203,7 @@ pub(super) struct Nearby {
 #[derive(Debug, Clone, Copy)]
 struct Probe {
     /// Cells in the buffer.
-    step: isize,
+    step: i32,
     dx: f32,
     dy: f32,
     /// By how much its inverse depth may differ, relative.
@@ -217,6 +218,61 @@ fn larger(a: f32, b: f32) -> f32 {
 #[inline(always)]
 fn smaller(a: f32, b: f32) -> f32 {
     if a < b { a } else { b }
+}
+
+/// All samples at once, until each has found its neighbour.
+///
+/// # Safety
+/// Every cell and every step from it has to lie in `samples`.
+#[cfg(target_arch = "x86_64")]
+#[target_feature(enable = "avx2")]
+unsafe fn nearby_avx2(samples: &[Sample], rings: &[[Probe; RING]; QUADRANTS], cells: &[u32; LANES]) -> Nearby {
+    use std::arch::x86_64::*;
+    let memory = samples.as_ptr().cast::<i32>();
+    // SAFETY: the caller's; positions in a buffer are below 2³¹.
+    let gather = |at: __m256i| unsafe { _mm256_i32gather_epi32::<4>(memory, at) };
+    let depth = |samples: __m256i| _mm256_castsi256_ps(Sample::inverse_depth_bits(samples));
+    let at = _mm256_setr_epi32(
+        cells[0] as i32,
+        cells[1] as i32,
+        cells[2] as i32,
+        cells[3] as i32,
+        cells[4] as i32,
+        cells[5] as i32,
+        cells[6] as i32,
+        cells[7] as i32,
+    );
+    let own = depth(gather(at));
+    let (none, no_sign) = (_mm256_setzero_si256(), _mm256_castsi256_ps(_mm256_set1_epi32(i32::MAX)));
+    let mut nearby = Nearby::default();
+    for (k, ring) in rings.iter().enumerate() {
+        let (mut best, mut dx, mut dy) = (none, _mm256_setzero_ps(), _mm256_setzero_ps());
+        let mut missing = _mm256_cmpeq_epi32(none, none);
+        for probe in ring {
+            let other = gather(_mm256_add_epi32(at, _mm256_set1_epi32(probe.step)));
+            let v = depth(other);
+            let apart = _mm256_and_ps(_mm256_sub_ps(v, own), no_sign);
+            let allowed = _mm256_mul_ps(_mm256_max_ps(own, v), _mm256_set1_ps(probe.allowed));
+            let one_surface = _mm256_castps_si256(_mm256_cmp_ps::<_CMP_LE_OQ>(apart, allowed));
+            let empty = _mm256_cmpeq_epi32(other, none);
+            let taken = _mm256_andnot_si256(empty, _mm256_and_si256(one_surface, missing));
+            let mask = _mm256_castsi256_ps(taken);
+            best = _mm256_blendv_epi8(best, other, taken);
+            dx = _mm256_blendv_ps(dx, _mm256_set1_ps(probe.dx), mask);
+            dy = _mm256_blendv_ps(dy, _mm256_set1_ps(probe.dy), mask);
+            missing = _mm256_andnot_si256(taken, missing);
+            if _mm256_testz_si256(missing, missing) == 1 {
+                break;
+            }
+        }
+        // SAFETY: the arrays hold eight numbers.
+        unsafe {
+            _mm256_storeu_si256(nearby.other[k].as_mut_ptr().cast(), best);
+            _mm256_storeu_ps(nearby.dx[k].as_mut_ptr(), dx);
+            _mm256_storeu_ps(nearby.dy[k].as_mut_ptr(), dy);
+        }
+    }
+    nearby
 }
 
 /// Up to [`LANES`] cells, the last one repeated.
@@ -261,7 +317,7 @@ impl<'a> Surroundings<'a> {
                 let (dx, dy) = turned(offset, k);
                 let distance = ((dx * dx + dy * dy) as f32).sqrt();
                 let allowed = tolerance + steepest * distance;
-                Probe { step: dy * stride + dx, dx: dx as f32, dy: dy as f32, allowed }
+                Probe { step: (dy * stride + dx) as i32, dx: dx as f32, dy: dy as f32, allowed }
             })
         });
         let [gap_ratio, row_ratio] = ratios;
@@ -333,32 +389,28 @@ impl<'a> Surroundings<'a> {
     pub fn nearby(&self, cells: &[u32; LANES]) -> Nearby {
         let rim = PAD * (self.grid.stride() + 1);
         assert!(cells.iter().all(|&cell| (rim..self.samples.len() - rim).contains(&(cell as usize))));
-        let own = cells.map(|cell| self.samples[cell as usize].inverse_depth());
-        let none = [[0.0; LANES]; QUADRANTS];
-        let mut nearby = Nearby { other: [[0; LANES]; QUADRANTS], dx: none, dy: none };
+        #[cfg(target_arch = "x86_64")]
+        if std::arch::is_x86_feature_detected!("avx2") {
+            // SAFETY: the processor has the feature; no probe goes farther than the rim is wide.
+            return unsafe { nearby_avx2(self.samples, &self.rings, cells) };
+        }
+        self.nearby_one_by_one(cells)
+    }
+
+    fn nearby_one_by_one(&self, cells: &[u32; LANES]) -> Nearby {
+        let mut nearby = Nearby::default();
         for (k, ring) in self.rings.iter().enumerate() {
-            let (mut best, mut dx, mut dy) = ([0_u32; LANES], [0.0_f32; LANES], [0.0_f32; LANES]);
-            for probe in ring {
-                let mut other = [Sample::default(); LANES];
-                for l in 0..LANES {
-                    // SAFETY: no step is longer than the rim's width, and all cells are farther from the ends than that.
-                    other[l] = unsafe { *self.samples.get_unchecked((cells[l] as isize + probe.step) as usize) };
-                }
-                let mut missing = 0_u32;
-                for l in 0..LANES {
-                    let v = other[l].inverse_depth();
-                    let one_surface = (v - own[l]).abs() <= larger(own[l], v) * probe.allowed;
-                    let taken = other[l].found() & one_surface & (best[l] == 0);
-                    best[l] = if taken { other[l].0 } else { best[l] };
-                    dx[l] = if taken { probe.dx } else { dx[l] };
-                    dy[l] = if taken { probe.dy } else { dy[l] };
-                    missing |= u32::from(best[l] == 0);
-                }
-                if missing == 0 {
-                    break;
+            for (l, &cell) in cells.iter().enumerate() {
+                let own = self.samples[cell as usize].inverse_depth();
+                for probe in ring {
+                    let other = self.samples[(cell as i32 + probe.step) as usize];
+                    let v = other.inverse_depth();
+                    if other.found() && (v - own).abs() <= larger(own, v) * probe.allowed {
+                        (nearby.other[k][l], nearby.dx[k][l], nearby.dy[k][l]) = (other.0, probe.dx, probe.dy);
+                        break;
+                    }
                 }
             }
-            (nearby.other[k], nearby.dx[k], nearby.dy[k]) = (best, dx, dy);
         }
         nearby
     }

@@ -37,8 +37,10 @@ pub(super) struct Mark {
     slack: f32,
     /// How much more for each cell of distance.
     fading: f32,
-    /// Cells to the east, south, west and north.
-    covered: [f32; QUADRANTS],
+    /// One by the cells that it covers to the east, south, west and north.
+    per: [f32; QUADRANTS],
+    /// Whole cells that it reaches from the sample's own, in the same order.
+    cells: [f32; QUADRANTS],
 }
 
 impl Rule {
@@ -60,7 +62,16 @@ impl Rule {
             let reach = if link.found() { self.inner * link.distance } else { end };
             *covered = smaller(larger(reach, LEAST), MAX_REACH as f32 - 1.0);
         }
-        Mark { place: patch.place, own, gradient: [gx, gy], slack, fading: own * self.pixel_angle, covered }
+        let ([east, south, west, north], [right, down]) = (covered, patch.place);
+        Mark {
+            place: patch.place,
+            own,
+            gradient: [gx, gy],
+            slack,
+            fading: own * self.pixel_angle,
+            per: covered.map(|c| 1.0 / c),
+            cells: [east + right, south + down, west - right, north - down],
+        }
     }
 }
 
@@ -71,7 +82,7 @@ pub(super) struct Marks {
 }
 
 /// Numbers in a mark.
-const NUMBERS: usize = 7 + QUADRANTS;
+const NUMBERS: usize = 7 + 2 * QUADRANTS;
 
 impl Marks {
     /// Room for them.
@@ -82,9 +93,9 @@ impl Marks {
     /// Keeps one.
     #[inline(always)]
     pub fn set(&mut self, lane: usize, mark: &Mark) {
-        let Mark { place: [right, down], own, gradient: [gx, gy], slack, fading, covered: [east, south, west, north] } =
-            *mark;
-        let numbers = [right, down, own, gx, gy, slack, fading, east, south, west, north];
+        let Mark { place: [right, down], own, gradient: [gx, gy], slack, fading, per, cells } = *mark;
+        let ([e, s, w, n], [east, south, west, north]) = (per, cells);
+        let numbers = [right, down, own, gx, gy, slack, fading, e, s, w, n, east, south, west, north];
         for (kept, number) in self.numbers.iter_mut().zip(numbers) {
             kept[lane] = number;
         }
@@ -93,9 +104,10 @@ impl Marks {
     /// Gives one back.
     #[inline(always)]
     pub fn get(&self, lane: usize) -> Mark {
-        let [right, down, own, gx, gy, slack, fading, east, south, west, north] =
+        let [right, down, own, gx, gy, slack, fading, e, s, w, n, east, south, west, north] =
             std::array::from_fn(|k| self.numbers[k][lane]);
-        Mark { place: [right, down], own, gradient: [gx, gy], slack, fading, covered: [east, south, west, north] }
+        let (per, cells) = ([e, s, w, n], [east, south, west, north]);
+        Mark { place: [right, down], own, gradient: [gx, gy], slack, fading, per, cells }
     }
 }
 
@@ -108,31 +120,32 @@ pub(super) struct Canvas<'a> {
 }
 
 impl Canvas<'_> {
-    /// Draws what the sample in a cell covers, where nothing nearer is drawn.
+    /// Draws what the sample in a row and column covers, where nothing nearer is drawn.
     #[inline(always)]
-    pub fn draw(&mut self, grid: &Grid, cell: usize, mark: &Mark) {
+    pub fn draw(&mut self, grid: &Grid, [row, column]: [usize; 2], mark: &Mark) {
         let stride = grid.stride();
-        let (column, row) = ((cell as u32 % stride as u32) as usize, (cell as u32 / stride as u32) as usize);
-        let ([right, down], [east, south, west, north]) = (mark.place, mark.covered);
-        // Cells are numbered from the sample's own.
-        let up = ((north - down) as usize).min(row - self.first_row) as isize;
-        let below =
-            ((south + down).max(0.0) as usize).min(self.first_row + self.cells.len() / stride - 1 - row) as isize;
-        let before = ((west - right) as usize).min(column);
-        let after = ((east + right).max(0.0) as usize).min(stride - 1 - column);
+        let [right, down] = mark.place;
+        let [per_east, per_south, per_west, per_north] = mark.per;
+        // Not beyond the grid and the canvas.
+        let [after, below, before, up] = mark.cells;
+        let up = (up as i32).min((row - self.first_row) as i32).max(0) as isize;
+        let below = (below as i32).min((self.first_row + self.cells.len() / stride - 1 - row) as i32).max(0) as isize;
+        let before = (before as i32).min(column as i32).max(0) as usize;
+        let after = (after as i32).min((stride - 1 - column) as i32).max(0) as usize;
         let home = (row - self.first_row) * stride + column;
-        let (per_east, per_west) = (1.0 / east, 1.0 / west);
-        let (per_south, per_north) = (1.0 / south, 1.0 / north);
         let mut first = 0;
         while first <= before + after {
             // Cells side by side: how far right, by the sample's own measure, and what of the plane does not change
             // from row to row. Beyond the last one everything is infinitely far.
+            let (offset, last) = (first as f32 - before as f32, after as f32);
             let (mut dx2, mut rx2, mut value) = ([0.0_f32; LANES], [0.0_f32; LANES], [0.0_f32; LANES]);
             for l in 0..LANES {
-                let dx = ((first + l) as i32 - before as i32) as f32 - right;
+                // Whole numbers, in one kind of register.
+                let column = offset + l as f32;
+                let dx = column - right;
                 let rx = dx * if dx > 0.0 { per_east } else { per_west };
                 dx2[l] = dx * dx;
-                rx2[l] = if first + l <= before + after { rx * rx } else { f32::INFINITY };
+                rx2[l] = if column <= last { rx * rx } else { f32::INFINITY };
                 value[l] = mark.own + mark.gradient[0] * dx;
             }
             for j in -up..=below {

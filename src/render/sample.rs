@@ -44,6 +44,16 @@ impl Sample {
         f32::from_bits(((self.0 >> (2 * PLACE)) << DROPPED | 1 << (DROPPED - 1)) + BASE)
     }
 
+    /// The bits of the inverse depths of eight samples.
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    pub(super) fn inverse_depth_bits(samples: std::arch::x86_64::__m256i) -> std::arch::x86_64::__m256i {
+        use std::arch::x86_64::*;
+        let steps = _mm256_slli_epi32::<{ DROPPED as i32 }>(_mm256_srli_epi32::<{ 2 * PLACE as i32 }>(samples));
+        let middle = _mm256_or_si256(steps, _mm256_set1_epi32(1 << (DROPPED - 1)));
+        _mm256_add_epi32(middle, _mm256_set1_epi32(BASE as i32))
+    }
+
     /// The same sample in a pixel that stands on its head.
     pub(super) fn upside_down(self) -> Self {
         Self(if self.found() { self.0 ^ ((1 << PLACE) - 1) } else { 0 })

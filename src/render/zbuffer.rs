@@ -47,7 +47,7 @@ impl Grid {
         let wraps = view.camera.model() == Model::Equirectangular;
         let margin = MAX_MARGIN.min(width.max(height) / 16).min(width / 2).min(height);
         let grid = Self { width, height, margin, wraps };
-        if grid.stride().saturating_mul(grid.rows()) >= NOWHERE as usize {
+        if grid.stride().saturating_mul(grid.rows()) > i32::MAX as usize {
             return Err(Error::invalid(format!(
                 "a photo of {width} × {height} pixels is too large for a depth buffer; make it smaller"
             )));
@@ -111,6 +111,12 @@ impl Grid {
     #[inline(always)]
     pub fn cell(&self, column: usize, row: usize) -> usize {
         (row + self.margin + PAD) * self.stride() + column + self.margin + PAD
+    }
+
+    /// The row and column of a cell.
+    pub(super) fn row_and_column(&self, cell: u32) -> [usize; 2] {
+        let stride = self.stride() as u32;
+        [(cell / stride) as usize, (cell % stride) as usize]
     }
 
     /// The photo's part of a buffer's row.

@@ -105,10 +105,7 @@ impl<'a> Colourist<'a> {
     #[inline(always)]
     fn sample(&self, view: usize, xy: [f64; 2]) -> [f32; 3] {
         let colour = self.photos[view].sample(xy, self.interpolation);
-        match &self.gains {
-            Some(gains) => std::array::from_fn(|k| (colour[k] * gains[view][k]).min(65535.0)),
-            None => colour,
-        }
+        amplified(colour, self.gains.as_ref().map(|gains| &gains[view]))
     }
 
     fn colour_by_one(
@@ -120,12 +117,29 @@ impl<'a> Colourist<'a> {
         source: &mut [u16],
     ) {
         self.maps[view].look(points, sight);
-        for (i, (rgb, source)) in rgb.iter_mut().zip(source).enumerate() {
-            if sight.cell(i).is_some() {
-                *rgb = rounded(self.sample(view, sight.xy(i)));
-                *source = view as u16 + 1;
-            }
+        #[cfg(target_arch = "x86_64")]
+        if std::arch::is_x86_feature_detected!("avx2") {
+            // SAFETY: the processor has the feature.
+            return unsafe { self.take_from_one_avx2(view, sight, rgb, source) };
         }
+        self.take_from_one(view, sight, rgb, source);
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    unsafe fn take_from_one_avx2(&self, view: usize, sight: &Sight, rgb: &mut [[u16; 3]], source: &mut [u16]) {
+        self.take_from_one(view, sight, rgb, source);
+    }
+
+    #[inline(always)]
+    fn take_from_one(&self, view: usize, sight: &Sight, rgb: &mut [[u16; 3]], source: &mut [u16]) {
+        let gains = self.gains.as_ref().map(|gains| gains[view]);
+        let count = rgb.len();
+        let at = |i: usize| (i < count && sight.cell(i).is_some()).then(|| sight.xy(i));
+        self.photos[view].sample_each(self.interpolation, at, |i, colour| {
+            rgb[i] = rounded(amplified(colour, gains.as_ref()));
+            source[i] = view as u16 + 1;
+        });
     }
 
     fn colour_by_several(
@@ -156,6 +170,14 @@ impl<'a> Colourist<'a> {
                 *source = view as u16 + 1;
             }
         }
+    }
+}
+
+#[inline(always)]
+fn amplified(colour: [f32; 3], gains: Option<&[f32; 3]>) -> [f32; 3] {
+    match gains {
+        Some(gains) => std::array::from_fn(|k| (colour[k] * gains[k]).min(65535.0)),
+        None => colour,
     }
 }
 

@@ -534,4 +534,34 @@ mod tests {
         }
         assert_eq!(seen.len(), 48);
     }
+
+    #[test]
+    fn eight_samples_at_once_find_what_each_finds_alone() {
+        let camera = crate::Camera::new(crate::Model::Pinhole, 96, 64, &[80.0, 80.0, 47.5, 31.5]).unwrap();
+        let view = crate::View { camera, pose: crate::Pose::identity() };
+        let grid = Grid::new(&view).unwrap();
+        let mut state = 7_u32;
+        let mut random = || {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            f64::from(state >> 8) as f32 / (1 << 24) as f32
+        };
+        let mut samples = vec![Sample::default(); grid.len()];
+        for y in grid.first_row()..grid.rows() - grid.first_row() {
+            for x in grid.used_columns() {
+                if random() > 0.3 {
+                    continue;
+                }
+                let inverse = if random() < 0.5 { 0.1 } else { 0.1 + 0.01 * random() };
+                samples[y * grid.stride() + x] = Sample::new(inverse, [random(), random()]);
+            }
+        }
+        let surroundings = Surroundings::new(grid, &samples, 20.0, 1.0 / 80.0, [2.0, 4.0]);
+        let mut found = Vec::new();
+        (0..grid.rows()).skip(PAD).take(grid.rows() - 2 * PAD).for_each(|y| surroundings.found(y, &mut found));
+        assert!(found.len() > 1000);
+        for cells in found.chunks(LANES) {
+            let cells = filled(cells);
+            assert_eq!(surroundings.nearby(&cells), surroundings.nearby_one_by_one(&cells));
+        }
+    }
 }

@@ -157,7 +157,7 @@ impl Patch {
             let allowed = self.own * (5.0 * s.noise * self.own + s.usual * near) + 0.5 * near * smaller(sa, sb);
             let bent = self.between(k) & (bend > allowed) & (larger(sa, sb) > self.own * s.usual);
             self.links[k] = a.unless(bent & (sa > sb));
-            self.links[k + 2] = b.unless(bent & !(sa > sb));
+            self.links[k + 2] = b.unless(bent & (sa <= sb));
         }
         let (before, spacing) = (self.links, self.spacing());
         for (k, link) in self.links.iter_mut().enumerate() {

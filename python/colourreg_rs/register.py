@@ -189,6 +189,9 @@ def register_photo(
             result = _by_resection(photo, control, start, options)
     except (DegenerateError, InvalidInputError) as error:
         raise FileError(points, str(error)) from error
+    except NotConvergedError as error:
+        remedy = "are the points paired rightly, the axes in order, the frame right-handed?"
+        raise FileError(points, str(error), remedy) from error
     view = result.view
     if result.doubts:  # whoever uses the file must hear of them
         view = replace(view, statistics={**view.statistics, "doubts": list(result.doubts)})

@@ -156,6 +156,76 @@ def test_bad_data_is_one_line_and_exit_code_1(job, arguments, file, problem):
     assert sorted(job.iterdir()) == before
 
 
+REGISTER = ["register", "scan.laz", "photo.png", "--points", "points.csv", "--camera", "camera.json"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "victim"),
+    [
+        ([*REGISTER, "--out", "photo.png"], "photo.png"),
+        ([*REGISTER, "--out", "x.json", "--json", "points.csv"], "points.csv"),
+        ([*REGISTER, "--out", "x.json", "--report", "scan.laz"], "scan.laz"),
+        ([*REGISTER, "--init", "registration.json", "--out", "alias"], "registration.json"),
+        (["info", "camera.json", "--json", "camera.json"], "camera.json"),
+        (["evaluate", "registration.json", "--report", "photo.png"], "photo.png"),
+        (["evaluate", "registration.json", "--json", "scan.laz"], "scan.laz"),
+        (["colourise", "scan.laz", "registration.json", "--out", "x.laz", "--json", "photo.png"], "photo.png"),
+        (["backproject", "scan.laz", "registration.json", "--out", "x.laz", "--json", "alias"], "registration.json"),
+        (["sci", "scan.laz", "--view", "registration.json", "--out", "x", "--json", "scan.laz"], "scan.laz"),
+    ],
+)
+def test_no_output_takes_the_place_of_an_input(job, arguments, victim):
+    """Under any option, and under another name; and before any work, so that nothing else is written either."""
+    (job / "alias").unlink(missing_ok=True)
+    (job / "alias").symlink_to(job / "registration.json")
+    kept, before = (job / victim).read_bytes(), sorted(job.iterdir())
+    done = colourreg(*arguments, cwd=job)
+    assert done.returncode == 1 and done.stderr.count("\n") == 1
+    assert victim in done.stderr and "would be lost" in done.stderr
+    assert (job / victim).read_bytes() == kept and sorted(job.iterdir()) == before
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["colourise", "scan.laz", "registration.json", "--out", "x.laz", "--json", "absent/x.json"],
+        ["colourise", "scan.laz", "registration.json", "--out", "x.laz", "--json", "x.laz"],
+        ["evaluate", "registration.json", "--report", "x.html", "--json", "absent/x.json"],
+        ["sci", "scan.laz", "--view", "registration.json", "--out", "x", "--json", "absent/x.json"],
+        ["sci", "scan.laz", "--view", "registration.json", "--out", "scan.laz"],
+        ["simulate", "trial", "--out", "x", "--json", "absent/x.json"],
+        ["reproduce", "table2", "--out", "scan.laz"],
+        ["demo", "--out", "scan.laz"],
+    ],
+)
+def test_what_cannot_be_written_is_said_before_the_work(job, arguments):
+    before = sorted(job.iterdir())
+    done = colourreg(*arguments, cwd=job)
+    assert done.returncode == 1 and done.stderr.count("\n") == 1
+    assert sorted(job.iterdir()) == before
+
+
+def test_pictures_of_several_views_stay_in_their_folder(job, tmp_path):
+    """Names of views come out of files, and may be the same, or lead elsewhere."""
+    content = json.loads((job / "registration.json").read_text())
+    content["views"] *= 3
+    content["views"] = [
+        dict(view, name=name) for view, name in zip(content["views"], ["../a", "../a", ".."], strict=True)
+    ]
+    (job / "three.json").write_text(json.dumps(content))
+    done = colourreg("sci", "scan.laz", "--view", "three.json", "--out", tmp_path / "out" / "in", cwd=job)
+    assert done.returncode == 0, done.stderr
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["in"]
+    assert len(list((tmp_path / "out" / "in").glob("*/view.json"))) == 3
+
+
+def test_points_that_give_no_view_are_named_with_their_file(job):
+    points = read_points(job / "points.csv")
+    write_points(job / "same.csv", [replace(p, xyz=points[0].xyz, xy=points[0].xy) for p in points])
+    done = colourreg("register", "scan.laz", "photo.png", "--points", "same.csv", "--out", "x.json", cwd=job)
+    assert done.returncode == 1 and done.stderr.startswith("colourreg: same.csv: ") and done.stderr.count("\n") == 1
+
+
 def test_a_registration_of_another_place_is_refused_and_nothing_is_written(job):
     content = json.loads((job / "registration.json").read_text())
     content["views"][0]["pose"]["translation"][0] += 5000.0

@@ -11,7 +11,7 @@ import contextlib
 import os
 import secrets
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any
@@ -99,6 +99,42 @@ def refuse_target(path: Path, sources: tuple[str | Path, ...] = ()) -> None:
     except (OSError, ValueError, RuntimeError) as error:
         detail = reason(error) if isinstance(error, OSError) else str(error)
         raise FileError(path, f"cannot be written: {detail}", None) from error
+
+
+def refuse_outputs(
+    files: Sequence[Path | None], inputs: Iterable[Path | None] = (), folders: Sequence[Path | None] = ()
+) -> None:
+    """Says before the work what could not, or must not, be written after it.
+
+    Args:
+        files: the outputs, ``None`` for those that were not asked for; no two may be the same.
+        inputs: what the outputs are made from; none may be an output, under whatever name.
+        folders: outputs that are folders, made where they are missing.
+
+    Raises FileError.
+    """
+    sources = tuple(path for path in inputs if path is not None and _is_there(path))
+    taken: dict[Path, Path] = {}
+    for path in files:
+        if path is None:
+            continue
+        refuse_target(path, sources)
+        target = path.resolve()
+        if target in taken:
+            raise FileError(path, "is named for two outputs, of which one would be lost", "give each a name of its own")
+        taken[target] = path
+        if not os.access(target.parent, os.W_OK):
+            raise FileError(path, "cannot be written: permission denied", "check the permissions of the folder")
+    for folder in folders:
+        if folder is not None and _is_there(folder) and not folder.is_dir():
+            raise FileError(folder, "is a file, and a folder is to be written", "name another folder")
+
+
+def _is_there(path: Path) -> bool:
+    try:
+        return path.exists()
+    except (OSError, ValueError):
+        return False
 
 
 def write_bytes(path: str | Path, data: bytes | memoryview, sources: tuple[str | Path, ...] = ()) -> None:

@@ -61,8 +61,9 @@ def read_registration(path: str | Path) -> Registration:
 
 
 def write_registration(path: str | Path, registration: Registration) -> None:
-    """Writes a registration, atomically; numbers come back as they were, to the last bit."""
+    """Writes a registration, atomically; numbers come back as they were, to the last bit. Never over its own files."""
     path = Path(path)
+    sources = (registration.cloud, *(view.image for view in registration.views))
     data = {
         "format": FORMAT,
         "version": VERSION,
@@ -70,7 +71,7 @@ def write_registration(path: str | Path, registration: Registration) -> None:
         "crs_wkt": registration.crs_wkt,
         "views": [_view_data(path, view) for view in registration.views],
     }
-    write_text(path, _json(data))
+    write_text(path, _json(data), tuple(source for source in sources if source is not None and source.exists()))
 
 
 def read_camera(path: str | Path) -> Camera:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +11,27 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import FileError
-from ..model import Registration
+from ..model import Registration, View
 from ..sci import SCI
 from .atomic import AtomicFile, reason
 from .images import write_image
 from .registration import write_registration
+
+#: What :func:`write_sci` may write into its folder.
+FILES = (
+    "intensity.png", "measured.png", "raw.tif", "depth.tif", "index.tif", "subpixel.tif", "colour.png", "normals.tif",
+    "view.json",
+)  # fmt: skip
+
+
+def view_folders(folder: Path, views: Sequence[View]) -> list[Path]:
+    """A folder for each view: ``folder`` itself for a single one, else one below it, by the name, for each."""
+    if len(views) == 1:
+        return [folder]
+    # Names come out of files: nothing in them may lead elsewhere, and two views may have the same one.
+    names = [re.sub(r"[^\w.\- ]", "_", view.name).strip(". ") or "view" for view in views]
+    twice = {name for name in names if names.count(name) > 1}
+    return [folder / (f"{i}-{name}" if name in twice else name) for i, name in enumerate(names, 1)]
 
 
 def write_sci(folder: str | Path, sci: SCI) -> list[Path]:

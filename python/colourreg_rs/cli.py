@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+import warnings
 from collections.abc import Sequence
 from contextlib import suppress
 from enum import StrEnum
@@ -223,6 +224,8 @@ def sci(
     result = []
     for one, folder in zip(registration.views, folders, strict=True):
         image = render_sci(points, one, bits=bits, fill=fill, tolerance=tolerance)  # type: ignore[arg-type]
+        if not image.measured.any():
+            raise FileError(view, f"no point of {cloud} lies in view {one.name!r}", "check its pose, frame and unit")
         write_sci(folder, image)
         measured, seen = float(image.measured.mean()), float(image.seen.mean())
         by_range, by_incidence = image.exponents
@@ -437,6 +440,7 @@ for _command, _american in ((colourise, "colorize"),):
 
 def main() -> None:
     """Runs the command; what goes wrong is one line on standard error and exit code 1."""
+    warnings.simplefilter("ignore", RuntimeWarning)  # of arithmetic on absurd numbers; it is no word to a user
     try:
         app()
     except ColourregError as error:

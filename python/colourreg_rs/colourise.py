@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from . import _core
-from .errors import FileError, InvalidInputError
+from .errors import DegenerateError, FileError, InvalidInputError
 from .io.clouds import CloudChunk, CloudReader, CloudWriter, create_cloud, open_cloud
 from .io.images import photo_info, read_photo
 from .io.registration import read_registration
@@ -227,7 +227,13 @@ def load_views(paths: Sequence[Path]) -> list[View]:
                     f"has {size[0]} x {size[1]} pixels, its camera in {path} {wanted}",
                     "use the photo that was registered, not a scaled or turned copy",
                 )
-            views.append(view if view.image_size else replace(view, size=size))
+            view = view if view.image_size else replace(view, size=size)
+            try:
+                _surface_sigma(view, ColouriseOptions())
+                _ = view.core
+            except (DegenerateError, InvalidInputError) as error:
+                raise FileError(path, f"view {view.name!r}: {error}") from error
+            views.append(view)
     return views
 
 
@@ -288,9 +294,13 @@ def _doubts(views: Sequence[View]) -> tuple[str, ...]:
 
 def _nothing_seen(views: Sequence[View], reader: CloudReader) -> str:
     box = reader.told_extent() or reader.extent()
-    extent = "x ".join(f"{a:.1f}…{b:.1f} " for a, b in zip(box.low, box.high, strict=True))
-    place = ", ".join(f"{v:.1f}" for v in views[0].core.centre)
+    extent = " x ".join(f"{_metres(a)}…{_metres(b)}" for a, b in zip(box.low, box.high, strict=True))
+    place = ", ".join(_metres(v) for v in views[0].core.centre)
     return f"none of its points lies in any photo; it spans {extent}, view {views[0].name!r} stands at {place}"
+
+
+def _metres(value: float) -> str:
+    return f"{value:.1f}" if abs(value) < 1e9 else f"{value:.3g}"
 
 
 def _positions(reader: CloudReader, options: ColouriseOptions) -> Iterator[CloudChunk]:

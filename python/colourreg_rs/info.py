@@ -49,7 +49,7 @@ def _describe_json(path: Path) -> dict[str, Any]:
 
     try:
         content = json.loads(path.read_text(encoding="utf-8-sig"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError):
+    except (OSError, ValueError, RecursionError):
         content = None  # the reader below says what is wrong
     if isinstance(content, dict) and "model" in content and "views" not in content:
         return {"kind": "camera", **_camera(read_camera(path))}

@@ -219,6 +219,46 @@ def test_pictures_of_several_views_stay_in_their_folder(job, tmp_path):
     assert len(list((tmp_path / "out" / "in").glob("*/view.json"))) == 3
 
 
+def _without_cloud(view):
+    """A view that looks the other way: the half turn about its vertical axis."""
+    pose = view["pose"]
+    turn = np.diag([-1.0, 1.0, -1.0])
+    pose["rotation"] = (turn @ np.array(pose["rotation"])).tolist()
+    pose["translation"] = (turn @ np.array(pose["translation"])).tolist()
+
+
+@pytest.mark.parametrize(
+    ("change", "command", "file", "problem"),
+    [
+        (lambda v: v["camera"].update(width=601), "sci", "photo.png", "601 x 400"),
+        (lambda v: v["camera"].update(width=601), "evaluate", "photo.png", "601 x 400"),
+        (lambda v: v["covariance"]["parameters"].__setitem__(0, "banana"), "colourise", "broken.json", "banana"),
+        (lambda v: v["covariance"]["matrix"][0].__setitem__(0, -1.0), "info", "broken.json", "variance of rx"),
+        (lambda v: v.update(camera=None, pose=None, dlt=[[0.0] * 4] * 3), "colourise", "broken.json", "DLT"),
+        (lambda v: v.update(camera=None, pose=None, dlt=[[0.0] * 4] * 3), "sci", "broken.json", "DLT"),
+        (lambda v: v["statistics"].update(doubts=5), "colourise", "broken.json", "statistics.doubts"),
+        (lambda v: v["statistics"].update(sigma0="abc"), "evaluate", "broken.json", "statistics.sigma0"),
+        (_without_cloud, "sci", "broken.json", "no point"),
+        (_without_cloud, "colourise", "scan.laz", "none of its points"),
+    ],
+)
+def test_a_broken_registration_is_one_line_from_every_command(job, change, command, file, problem):
+    content = json.loads((job / "registration.json").read_text())
+    change(content["views"][0])
+    (job / "broken.json").write_text(json.dumps(content))
+    before = set(job.rglob("*"))
+    arguments = {
+        "info": ["info", "broken.json"],
+        "evaluate": ["evaluate", "broken.json"],
+        "colourise": ["colourise", "scan.laz", "broken.json", "--out", "x.laz"],
+        "sci": ["sci", "scan.laz", "--view", "broken.json", "--out", "x"],
+    }[command]
+    done = colourreg(*arguments, cwd=job)
+    assert done.returncode == 1 and done.stderr.count("\n") == 1
+    assert file in done.stderr and problem in done.stderr and "defect" not in done.stderr
+    assert set(job.rglob("*")) == before
+
+
 def test_points_that_give_no_view_are_named_with_their_file(job):
     points = read_points(job / "points.csv")
     write_points(job / "same.csv", [replace(p, xyz=points[0].xyz, xy=points[0].xy) for p in points])

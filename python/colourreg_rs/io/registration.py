@@ -27,6 +27,8 @@ FORMAT, VERSION = "colourreg-registration", 1
 _LIMIT = 1 << 28
 #: How far a redundant matrix may be from the camera and pose beside it, relative to its size.
 _SAME = 1e-6
+#: Statistics of a view that are numbers.
+_FIGURES = ("sigma0", "dof", "rms", "rms_x", "rms_y", "rmse")
 
 
 def read_registration(path: str | Path) -> Registration:
@@ -139,7 +141,9 @@ def _validated(path: Path, part: type[Part], data: Any) -> Part:
         shown = (
             "" if isinstance(given, (dict, list)) or first["type"] == "missing" else f", not {json.dumps(given)[:60]}"
         )
-        raise FileError(path, f"{place}: {message[:1].lower()}{message[1:]}{shown}", "correct the value") from error
+        where = f"{place}: " if place else ""
+        shown = shown if place else ""
+        raise FileError(path, f"{where}{message[:1].lower()}{message[1:]}{shown}", "correct the value") from error
 
 
 def _camera(part: CameraPart) -> Camera:
@@ -169,6 +173,7 @@ def _view(path: Path, place: str, part: ViewPart, number: int) -> View:
         if len(rows) != n or any(len(row) != n for row in rows):
             raise FileError(path, f"{place}.covariance: the matrix is not {n} x {n}", "one row for each parameter")
         covariance = Covariance(tuple(part.covariance.parameters), np.array(rows, dtype=np.float64).reshape(n, n))
+        _check_covariance(path, f"{place}.covariance", covariance)
     return View(
         name=name,
         image=image,
@@ -192,8 +197,46 @@ def _view(path: Path, place: str, part: ViewPart, number: int) -> View:
             )
             for p in part.points or ()
         ),
-        statistics=dict(part.statistics or {}),
+        statistics=_statistics(path, f"{place}.statistics", part.statistics or {}),
     )
+
+
+def _check_covariance(path: Path, place: str, covariance: Covariance) -> None:
+    names, matrix = covariance.parameters, covariance.matrix
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise FileError(path, f"{place}: names {twice} twice", "each parameter has one row")
+    variances = np.diag(matrix)
+    if (variances < 0).any():
+        i = int(np.argmin(variances))
+        raise FileError(
+            path, f"{place}: the variance of {names[i]} is negative, {variances[i]:g}", "correct the matrix"
+        )
+    scale = np.maximum(np.maximum(np.abs(matrix), np.abs(matrix.T)), np.sqrt(np.outer(variances, variances)))
+    if (off := np.abs(matrix - matrix.T) > _SAME * scale).any():
+        i, j = np.argwhere(off)[0]
+        raise FileError(
+            path,
+            f"{place}: is not symmetric, {names[i]} and {names[j]} have {matrix[i, j]:g} and {matrix[j, i]:g}",
+            "correct the matrix",
+        )
+
+
+def _statistics(path: Path, place: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Those that are known (null stands for a figure that does not exist) have the type that they were written with."""
+    known: dict[str, tuple[type, ...]] = dict.fromkeys(_FIGURES, (int, float)) | {
+        "doubts": (list,),
+        "adjustment": (dict,),
+    }
+    statistics = {key: value for key, value in given.items() if value is not None or key not in known}
+    for key, value in statistics.items():
+        right = isinstance(value, known.get(key, (object,))) and not (key in _FIGURES and isinstance(value, bool))
+        if key == "doubts":
+            right = right and all(isinstance(doubt, str) for doubt in value)
+        if not right:
+            wanted = {"doubts": "a list of sentences", "adjustment": "an object"}.get(key, "a number")
+            raise FileError(path, f"{place}.{key}: is not {wanted} but {json.dumps(value)[:60]}", "correct the value")
+    return statistics
 
 
 def _agrees(matrix: FloatArray, camera: Camera, pose: Pose) -> bool:

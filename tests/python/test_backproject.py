@@ -14,7 +14,7 @@ import pytest
 from colourreg_rs import Camera, InvalidInputError, PointCloud, Pose, Registration, View, _core
 from colourreg_rs.backproject import BackprojectOptions, Origin, backproject
 from colourreg_rs.io.clouds import open_cloud, read_cloud, write_cloud
-from colourreg_rs.io.images import write_png
+from colourreg_rs.io.images import write_image
 from colourreg_rs.io.registration import write_registration
 from colourreg_rs.simulate import simulate
 
@@ -259,7 +259,7 @@ def test_the_command_writes_a_coloured_cloud_that_says_what_each_point_is(suffix
     cloud, _ = wall_cloud(rng, view)
     write_cloud(tmp_path / "scan.laz", cloud)
     photo = rng.integers(0, 256, (180, 240, 3), dtype=np.uint8)
-    write_png(tmp_path / "photo.png", photo)
+    write_image(tmp_path / "photo.png", photo)
     named = View("photo", tmp_path / "photo.png", view.camera, view.pose)
     write_registration(tmp_path / "reg.json", Registration((named,), cloud=tmp_path / "scan.laz"))
     out = tmp_path / f"pixels{suffix}"
@@ -291,7 +291,7 @@ def test_what_the_command_cannot_do_is_one_line_and_no_file(tmp_path, rng):
     cloud, _ = wall_cloud(rng, view, n=5000)
     scan, photo, reg = tmp_path / "scan.laz", tmp_path / "photo.png", tmp_path / "reg.json"
     write_cloud(scan, cloud)
-    write_png(photo, np.zeros((180, 240, 3), np.uint8))
+    write_image(photo, np.zeros((180, 240, 3), np.uint8))
     named = View("photo", photo, view.camera, view.pose)
     write_registration(reg, Registration((named,), cloud=scan))
     away = view.pose.rotation * [[-1], [1], [-1]]

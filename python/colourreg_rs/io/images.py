@@ -108,11 +108,13 @@ def read_photo(path: str | Path) -> Photo:
     """Decodes a photo and turns it upright by its EXIF orientation.
 
     Raises:
-        FileError: as :func:`photo_info`, and for CMYK and other colour spaces and for 32 bits.
+        FileError: as :func:`whole_photo_info`, and for CMYK and other colour spaces and for 32 bits.
     """
     path = Path(path)
     with open_binary(path) as file, _opened(path, file) as image:
         info = _info(path, file, image)
+        if info.format == "PNG":  # Pillow takes one without its end as whole, and so would not say what `info` says
+            _check_png(path, file)
         if info.bits == 16:
             pixels: npt.NDArray[Any] = _png16(path) if info.format == "PNG" else _tiff16(path)
         else:
@@ -197,13 +199,6 @@ def write_image(
                 image.save(out.file, "PNG", compress_level=4)
             else:
                 image.save(out.file, "JPEG", quality=quality, subsampling=0, exif=_exif_block(exif or {}))
-
-
-def write_png(path: str | Path, pixels: npt.NDArray[Any]) -> None:
-    """Writes a PNG of 8 or 16 bits, atomically: (H, W) or (H, W, C), C 1, 3 or 4."""
-    if Path(path).suffix.lower() != ".png":
-        raise FileError(path, "a PNG file has another suffix", "name it .png")
-    write_image(path, pixels)
 
 
 @contextmanager

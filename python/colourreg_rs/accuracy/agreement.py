@@ -36,7 +36,10 @@ from ..model import FloatArray, PointCloud, View
 ALPHA = 0.01
 #: Of Tukey's biweight in two dimensions, as in the resection.
 TUKEY = 5.123
-#: The distance over which matches err together, as one sigma of a Gaussian and a share of the photo's long side.
+#: The distance over which matches err together, as one sigma of a Gaussian and a share of the photo's long side. This,
+#: the bias below and the unit of the sigmas are not those of :mod:`..matching.match_covariance`, which say how far off
+#: a view is that was fitted to matches. Here single templates are compared with a view that has never seen them, and
+#: the level of the test was set, and checked on other views, with all three together: none can be changed alone.
 CORRELATION_LENGTH = 0.06
 #: What the method is off by in common, px of the synthetic image, one sigma in x and in y (and, of rotation and scale,
 #: at half the photo's width): of cloud and photo, whose light differs, and of two photos. Found on 62 right views of

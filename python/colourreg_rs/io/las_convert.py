@@ -15,9 +15,6 @@ from .clouds import AnyArray, CloudChunk, CloudReader, Extent, MemoryReader
 from .las_header import EXTRA_TYPES, RECORD_SIZE, ExtraBytes, LasHeader, Record, attributes, describe_extra
 from .las_write import LasOutput
 
-#: The coordinates' step where the cloud's size allows it, in units of the cloud.
-FINEST_STEP = 1e-5
-
 _INTENSITY = "intensity_original"
 
 

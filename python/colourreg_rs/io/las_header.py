@@ -38,7 +38,8 @@ EXTRA_TYPES = ("", "u1", "i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f4", 
 #: No LAS file has more bytes than this before its points; a header that says so is not believed.
 _MOST_HEADER_BYTES = 1 << 28
 
-WAVEFORM_INTERNAL, WAVEFORM_EXTERNAL = 0b010, 0b100
+#: Bit of the global encoding: waveforms are in a file of their own.
+WAVEFORM_EXTERNAL = 0b100
 
 
 @dataclass(frozen=True)

@@ -171,7 +171,7 @@ def backproject_file(
     from .io.clouds import open_cloud, output_format, read_cloud, write_cloud
     from .io.images import read_photo
     from .io.registration import read_registration
-    from .register import with_photo_sizes
+    from .photo_sizes import with_photo_sizes
 
     registration = with_photo_sizes(read_registration(registration_path), Path(registration_path))
     photos = [view.image for view in registration.views]

@@ -9,7 +9,7 @@ import pytest
 
 from colourreg_rs import ControlPoint, FileError, PointCloud, write_cloud
 from colourreg_rs.io.clouds import CloudReader, open_cloud
-from colourreg_rs.register import _outside
+from colourreg_rs.register.control import outside_cloud
 
 
 @pytest.mark.parametrize("suffix", [".las", ".laz"])
@@ -52,8 +52,8 @@ def test_control_points_are_judged_without_reading_the_cloud(tmp_path, rng, monk
     monkeypatch.setattr(CloudReader, "extent", unwanted)
     near, beside, far = (ControlPoint("P", np.full(3, v), np.zeros(2)) for v in (5.0, 20.0, 9e3))
     with open_cloud(tmp_path / "c.laz") as cloud:
-        assert _outside([near], cloud, tmp_path / "p.csv") == ()
-        (warning,) = _outside([beside], cloud, tmp_path / "p.csv")
+        assert outside_cloud([near], cloud, tmp_path / "p.csv") == ()
+        (warning,) = outside_cloud([beside], cloud, tmp_path / "p.csv")
         assert "outside the cloud" in warning
         with pytest.raises(FileError, match="outside the cloud"):
-            _outside([far], cloud, tmp_path / "p.csv")
+            outside_cloud([far], cloud, tmp_path / "p.csv")

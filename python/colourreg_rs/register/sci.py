@@ -1,0 +1,42 @@
+"""A view without control points, by matching the photo with the synthetic camera image (SCI)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ..errors import InvalidInputError, NotConvergedError
+from ..io.clouds import read_cloud
+from ..io.images import read_photo
+from ..matching.register_sci import SciOptions, register_sci
+from ..model import Registration, View
+from .options import RegisterOptions, parse_prior
+from .result import RegisterResult
+from .start import StartingView
+
+
+def by_sci(cloud: Path, photo: Path, start: StartingView, options: RegisterOptions) -> RegisterResult:
+    """From the approximate view, without control points. A result that cannot be trusted is an error."""
+    if start.pose is None:
+        raise InvalidInputError("method sci starts from an approximate view: give a registration with --init")
+    free = options.free or ("pose",)
+    given = View(photo.stem, photo, start.camera, start.pose)
+    priors = tuple(parse_prior(text) for text in options.priors)
+    points = read_cloud(cloud)
+    found = register_sci(points, read_photo(photo).pixels, given, SciOptions(free=free, priors=priors))
+    if not found.trusted:
+        raise NotConvergedError(f"no registration that can be trusted: {'; '.join(found.reasons)}")
+    last = found.turns[-1]
+    return RegisterResult(
+        registration=Registration((found.view,), cloud, points.crs_wkt),
+        evaluation=None,
+        notes=(f"{start.origin}; free: {', '.join(free)}",),
+        free=free,
+        facts={
+            "matches_used": found.used,
+            "matches_found": last.matched,
+            "templates": last.templates,
+            "confirmed_share": round(found.confirmed, 3),
+            "confirmed_by_chance": round(found.by_chance, 3),
+            "predicted_error_px": round(found.predicted_error, 3),
+        },
+    )

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
+import warnings
 from collections.abc import Sequence
+from contextlib import suppress
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -64,6 +67,25 @@ def _write_json(path: Path | None, result: dict[str, Any] | list[Any]) -> None:
         write_text(path, json.dumps(result, indent=2, ensure_ascii=False, allow_nan=False) + "\n")
 
 
+def _refuse_outputs(
+    files: Sequence[Path | None],
+    inputs: Sequence[Path | None] = (),
+    registrations: Sequence[Path | None] = (),
+    folder: Path | None = None,
+) -> None:
+    """Before any work: outputs that cannot be written, or that would take the place of an input."""
+    from .io.atomic import refuse_outputs
+    from .io.registration import read_registration
+
+    named: list[Path | None] = []
+    for path in registrations:
+        if path is not None and any(file is not None for file in files):
+            with suppress(ColourregError):  # whoever reads it next says what is wrong
+                registration = read_registration(path)
+                named += [registration.cloud, *(view.image for view in registration.views)]
+    refuse_outputs(files, (*inputs, *registrations, *named), (folder,))
+
+
 def _show_version(wanted: bool) -> None:
     if wanted:
         print(f"colourreg {__version__}")
@@ -82,10 +104,11 @@ def options(
 @app.command()
 def demo(
     out: Annotated[Path, typer.Option(help="Folder for what the demo makes.")] = Path("colourreg-demo"),
-    seed: Annotated[int, typer.Option(help="Another scene for another number.")] = 0,
+    seed: Annotated[int, typer.Option(help="Another scene for another number.", min=0)] = 0,
     json_file: JsonOption = None,
 ) -> None:
     """The main job on simulated data whose truth is known: scene, registration, coloured cloud, figures, pictures."""
+    _refuse_outputs([json_file], folder=out)
     from .demo import run_demo
 
     with terminal_bars() as progress:
@@ -126,6 +149,7 @@ def simulate(
     json_file: JsonOption = None,
 ) -> None:
     """A scan and photos whose truth is known, with errors put in by hand."""
+    _refuse_outputs([json_file], folder=out)
     from .simulate import simulate_from_text
 
     with terminal_bars() as progress:
@@ -164,6 +188,7 @@ def info(
     json_file: JsonOption = None,
 ) -> None:
     """What clouds, photos (EXIF), registrations, cameras or lists of points hold."""
+    _refuse_outputs([json_file], files, [path for path in files if path.suffix.lower() == ".json"])
     from .info import describe, lines
 
     described = [describe(path) for path in files]
@@ -184,18 +209,23 @@ def sci(
     json_file: JsonOption = None,
 ) -> None:
     """Renders the synthetic camera image of a view: intensity, depth and point index."""
+    _refuse_outputs([json_file], [cloud], [view], folder=out)
     from .io.clouds import read_cloud
     from .io.registration import read_registration
-    from .io.sci import write_sci
+    from .io.sci import FILES, view_folders, write_sci
     from .photo_sizes import with_photo_sizes
     from .sci import render_sci
 
     registration = with_photo_sizes(read_registration(view), view)
+    folders = view_folders(out, registration.views)
+    there = [folder / name for folder in folders for name in FILES if (folder / name).exists()]
+    _refuse_outputs(there, [cloud], [view])
     points = read_cloud(cloud)
     result = []
-    for one in registration.views:
-        folder = out if len(registration.views) == 1 else out / one.name
+    for one, folder in zip(registration.views, folders, strict=True):
         image = render_sci(points, one, bits=bits, fill=fill, tolerance=tolerance)  # type: ignore[arg-type]
+        if not image.measured.any():
+            raise FileError(view, f"no point of {cloud} lies in view {one.name!r}", "check its pose, frame and unit")
         write_sci(folder, image)
         measured, seen = float(image.measured.mean()), float(image.seen.mean())
         by_range, by_incidence = image.exponents
@@ -239,7 +269,7 @@ def register(
     dlt_parameters: Annotated[
         int, typer.Option(help="Approximate values by 11 (h34 = 1) or 12 (singular vector).")
     ] = 11,
-    seed: Annotated[int, typer.Option(help="Of the search for blunders.")] = 0,
+    seed: Annotated[int, typer.Option(help="Of the search for blunders.", min=0)] = 0,
     report: ReportOption = None,
     force: Annotated[
         bool, typer.Option("--force", help="Write the registration even where it is not to be trusted.")
@@ -247,6 +277,7 @@ def register(
     json_file: JsonOption = None,
 ) -> None:
     """Estimates from where, and with what camera, a photo was taken."""
+    _refuse_outputs([out, json_file, report], [cloud, photo, points, init, camera], [init])
     from .register import RegisterOptions, register_photo
 
     chosen = RegisterOptions(
@@ -294,6 +325,7 @@ def colourise(
     json_file: JsonOption = None,
 ) -> None:
     """Colours every point that a photo sees; all other points and all attributes stay as they are."""
+    _refuse_outputs([out, json_file], [cloud], registrations)
     from .colourise import ColouriseOptions, colourise_file
 
     options = ColouriseOptions(
@@ -324,6 +356,7 @@ def evaluate(
     json_file: JsonOption = None,
 ) -> None:
     """How accurate a registration is: in pixels, millimetres and milliradians, with tests and advice."""
+    _refuse_outputs([report, json_file], [points, cloud], [registration])
     from .io.points import read_points
     from .io.registration import read_registration
     from .photo_sizes import with_photo_sizes
@@ -374,6 +407,7 @@ def backproject(
     json_file: JsonOption = None,
 ) -> None:
     """3D points, with colour, for the pixels of photos: measured, interpolated within one surface, or extended."""
+    _refuse_outputs([out, json_file], [cloud], [registration])
     from .backproject import BackprojectOptions, backproject_file
 
     options = BackprojectOptions(extension=extension, depth_sigma=depth_sigma, pixel_sigma=pixel_sigma)
@@ -389,6 +423,7 @@ def reproduce(
     json_file: JsonOption = None,
 ) -> None:
     """The experiments of the paper that this package began with, beside its figures and this package's own."""
+    _refuse_outputs([json_file], folder=out)
     from .experiments import reproduce as run
 
     with terminal_bars() as progress:
@@ -405,6 +440,7 @@ for _command, _american in ((colourise, "colorize"),):
 
 def main() -> None:
     """Runs the command; what goes wrong is one line on standard error and exit code 1."""
+    warnings.simplefilter("ignore", RuntimeWarning)  # of arithmetic on absurd numbers; it is no word to a user
     try:
         app()
     except ColourregError as error:
@@ -421,6 +457,16 @@ def main() -> None:
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         print(f"colourreg: {where}{error.strerror or error}", file=sys.stderr)
+        sys.exit(1)
+    except Exception as error:
+        if os.environ.get("COLOURREG_TRACEBACK"):
+            raise
+        what = " ".join(str(error).split())[:300]
+        print(
+            f"colourreg: a defect of colourreg itself: {type(error).__name__}: {what}; please report it with the "
+            "command; COLOURREG_TRACEBACK=1 shows where it is",
+            file=sys.stderr,
+        )
         sys.exit(1)
 
 

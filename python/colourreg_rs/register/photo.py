@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from ..errors import DegenerateError, FileError, InvalidInputError
+from ..errors import DegenerateError, FileError, InvalidInputError, NotConvergedError
 from ..io.clouds import open_cloud
 from ..io.images import whole_photo_info
 from ..io.points import read_points
@@ -71,6 +71,9 @@ def register_photo(
             result = by_resection(photo, control, start, options)
     except (DegenerateError, InvalidInputError) as error:
         raise FileError(points, str(error)) from error
+    except NotConvergedError as error:
+        remedy = "are the points paired rightly, the axes in order, the frame right-handed?"
+        raise FileError(points, str(error), remedy) from error
     view = result.view
     if result.doubts:  # whoever uses the file must hear of them
         view = replace(view, statistics={**view.statistics, "doubts": list(result.doubts)})

@@ -14,6 +14,7 @@ use std::sync::Mutex;
 
 use rayon::prelude::*;
 
+use super::extremes::{larger, smaller};
 use super::links::{LANES, Links, Surroundings, filled};
 use super::marks::{Canvas, MAX_REACH, Marks, Rule};
 use super::pyramid::Pyramid;
@@ -241,16 +242,6 @@ fn close_row(rows: &[&[f32]; 5], row: &mut [f32]) {
 #[target_feature(enable = "avx2")]
 unsafe fn close_row_avx2(rows: &[&[f32]; 5], row: &mut [f32]) {
     close_row_here(rows, row);
-}
-
-#[inline(always)]
-fn larger(a: f32, b: f32) -> f32 {
-    if a > b { a } else { b }
-}
-
-#[inline(always)]
-fn smaller(a: f32, b: f32) -> f32 {
-    if a < b { a } else { b }
 }
 
 /// One row, from five rows of limits about it.

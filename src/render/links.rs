@@ -7,6 +7,7 @@
 
 use rayon::prelude::*;
 
+use super::extremes::{larger, smaller};
 use super::pyramid::Pyramid;
 use super::sample::Sample;
 use super::zbuffer::{Grid, PAD};
@@ -208,16 +209,6 @@ struct Probe {
     dy: f32,
     /// By how much its inverse depth may differ, relative.
     allowed: f32,
-}
-
-#[inline(always)]
-fn larger(a: f32, b: f32) -> f32 {
-    if a > b { a } else { b }
-}
-
-#[inline(always)]
-fn smaller(a: f32, b: f32) -> f32 {
-    if a < b { a } else { b }
 }
 
 /// All samples at once, until each has found its neighbour.

@@ -1,6 +1,7 @@
 //! What one sample of a depth buffer covers: a quarter of an ellipse in each of four quadrants, on the plane through the
 //! sample and its neighbours.
 
+use super::extremes::{larger, smaller};
 use super::links::{LANES, Patch, QUADRANTS};
 use super::zbuffer::Grid;
 
@@ -179,14 +180,4 @@ impl Canvas<'_> {
             - mark.fading * (dx * dx + dy * dy).sqrt();
         self.cells[home] = larger(value, self.cells[home]);
     }
-}
-
-#[inline(always)]
-fn larger(a: f32, b: f32) -> f32 {
-    if a > b { a } else { b }
-}
-
-#[inline(always)]
-fn smaller(a: f32, b: f32) -> f32 {
-    if a < b { a } else { b }
 }

@@ -2,6 +2,7 @@
 //! surfaces that hide what lies behind; and the synthetic camera image (SCI), the photo that the scanner would have taken
 //! in its own light.
 
+mod extremes;
 pub mod filling;
 mod footprint;
 pub mod intensity;

@@ -14,12 +14,13 @@
 
 use nalgebra::{DMatrix, Matrix2, Vector2};
 
-use super::collinearity::{Collinearity, Priors};
+use super::collinearity::Collinearity;
 use super::fit::{cofactor, fit};
 use super::levenberg::{Limits, Outcome};
 use super::loss::Loss;
 use super::observations::Observations;
 use super::parameters::{FreeSet, MAX_FREE};
+use super::priors::Priors;
 use crate::error::{Error, Result};
 use crate::geometry::View;
 

@@ -1,6 +1,5 @@
 //! The collinearity equations as a least-squares problem: a view that sees known points where they were measured.
 
-use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
 
 use super::batch::{LANES, PoseSums};
@@ -8,77 +7,11 @@ use super::levenberg::{LeastSquares, Normal};
 use super::loss::Loss;
 use super::observations::Observations;
 use super::parameters::{FreeSet, MAX_FREE};
-use crate::geometry::{View, rotation_log, skew_matrix};
+use super::priors::Priors;
+use crate::geometry::View;
 
 /// Points per task. Sums are formed block by block and added in order: the same bits at any number of threads.
 const BLOCK: usize = 256 * LANES;
-
-/// A free parameter that was known before, with its sigma. Acts like an observation.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct PriorTerm {
-    /// Its place in the free set.
-    pub place: usize,
-    /// In the local frame; for `rx ry rz` a rotation vector counted from the reference.
-    pub value: f64,
-    /// Greater than zero.
-    pub sigma: f64,
-}
-
-/// Prior knowledge of a view.
-#[derive(Debug, Clone)]
-pub(super) struct Priors {
-    pub terms: Vec<PriorTerm>,
-    /// What rotation priors count from.
-    pub reference: Matrix3<f64>,
-}
-
-impl Default for Priors {
-    fn default() -> Self {
-        Self { terms: Vec::new(), reference: Matrix3::identity() }
-    }
-}
-
-impl Priors {
-    /// Misclosure in sigmas and its derivatives by the free parameters, for each term.
-    pub fn rows(&self, free: &FreeSet, view: &View) -> Vec<(f64, [f64; MAX_FREE])> {
-        if self.terms.is_empty() {
-            return Vec::new();
-        }
-        let values = free.values(view);
-        let turn = rotation_log(&(view.pose.rotation * self.reference.transpose()));
-        let by_turn = inverse_left_jacobian(&turn);
-        self.terms
-            .iter()
-            .map(|t| {
-                let mut row = [0.0; MAX_FREE];
-                let value = match free.rotation_axis(t.place) {
-                    Some(axis) => {
-                        for k in 0..3 {
-                            if let Some(place) = free.rotation_place(k) {
-                                row[place] = by_turn[(axis, k)] / t.sigma;
-                            }
-                        }
-                        turn[axis]
-                    }
-                    None => {
-                        row[t.place] = 1.0 / t.sigma;
-                        values[t.place]
-                    }
-                };
-                ((value - t.value) / t.sigma, row)
-            })
-            .collect()
-    }
-}
-
-/// d log(exp(δ) R) / dδ at log R = ω.
-fn inverse_left_jacobian(w: &Vector3<f64>) -> Matrix3<f64> {
-    let theta2 = w.norm_squared();
-    let theta = theta2.sqrt();
-    let k = skew_matrix(w);
-    let c = if theta < 1e-3 { 1.0 / 12.0 + theta2 / 720.0 } else { (1.0 - 0.5 * theta / (0.5 * theta).tan()) / theta2 };
-    Matrix3::identity() - k * 0.5 + k * k * c
-}
 
 /// The problem: which points, which parameters, which loss.
 pub(super) struct Collinearity<'a> {

@@ -11,13 +11,14 @@
 
 use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 
-use super::collinearity::{Collinearity, Priors};
+use super::collinearity::Collinearity;
 use super::dlt_linear::{NO_GAP, Normalised, dynamic};
 use super::fit::{cofactor, fit_plainly, residuals};
 use super::levenberg::{Limits, Stop};
 use super::loss::Loss;
 use super::observations::{Observations, Precision};
 use super::parameters::FreeSet;
+use super::priors::Priors;
 use super::resection::Status;
 use super::residuals::Rms;
 use super::verdict::{Evidence, Verdict, judge_fit, predicted_errors};

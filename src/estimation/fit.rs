@@ -3,11 +3,12 @@
 use nalgebra::DMatrix;
 use rayon::prelude::*;
 
-use super::collinearity::{Collinearity, Priors};
+use super::collinearity::Collinearity;
 use super::levenberg::{Limits, Outcome, minimise};
 use super::loss::Loss;
 use super::observations::Observations;
 use super::parameters::FreeSet;
+use super::priors::Priors;
 use crate::error::{Error, Result};
 use crate::geometry::View;
 

@@ -4,21 +4,23 @@
 //! given view, from nothing (P3P on spread points), or, where blunders are expected, by RANSAC. The result carries its
 //! covariance, its residuals, and a verdict.
 
-use nalgebra::{DMatrix, Matrix3, Vector3};
+use nalgebra::DMatrix;
 
-use super::blunders::{Criterion, critical_f2, median, select};
-use super::collinearity::{Collinearity, PriorTerm, Priors};
+use super::blunders::{Criterion, critical_f2, select};
+use super::collinearity::Collinearity;
 use super::fit::{cofactor, fit, residuals};
 use super::levenberg::{LeastSquares, Limits, Outcome, Stop};
 use super::loss::Loss;
 use super::observations::{Observations, Precision};
 use super::parameters::{FreeSet, POSE_NAMES};
+use super::priors::{Prior, Priors, resolve, set_values};
 use super::ransac::{self, RansacOptions};
 use super::residuals::Rms;
+use super::robust::{robust_scale, sandwich};
 use super::start::{self, Candidate, alike};
 use super::verdict::{Evidence, Verdict, judge_fit, log10_false_alarms, predicted_errors};
 use crate::error::{Error, Result};
-use crate::geometry::{Pose, View, rotation_exp};
+use crate::geometry::{Pose, View};
 
 /// A second view is as good as the first when the first is not at least this much more likely (log-likelihood ratio
 /// times two; 1 in 100).
@@ -26,17 +28,6 @@ const AMBIGUOUS: f64 = 9.21;
 
 /// log10 of the false alarms from which on a view may be chance.
 const CHANCE: f64 = -3.0;
-
-/// What was known of a parameter before.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Prior {
-    /// As in the free set; `rx ry rz` count from the rotation of the view given.
-    pub name: String,
-    /// In the parameter's unit, world coordinates for the projection centre.
-    pub value: f64,
-    /// Zero holds the parameter at its value.
-    pub sigma: f64,
-}
 
 /// Where the iteration starts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -508,92 +499,4 @@ impl Task {
             verdict,
         })
     }
-}
-
-/// The scale of residuals from their median: right for normal errors, untouched by blunders.
-fn robust_scale(o: &Observations, view: &View, free: usize) -> f64 {
-    let mut squares = o.squares(view);
-    squares.retain(|s| s.is_finite());
-    let n = 2.0 * squares.len() as f64;
-    let lost = if n > free as f64 { n / (n - free as f64) } else { 1.0 };
-    (median(&mut squares) / (2.0 * std::f64::consts::LN_2) * lost).sqrt().max(1e-9)
-}
-
-/// A⁻¹ B A⁻¹ with A = Σ w JᵀJ and B = Σ w² Jᵀv vᵀJ of the points: the covariance of an estimate whose residuals are
-/// not normal. Source: Huber and Ronchetti, Robust Statistics, 2nd ed., 7.6.
-fn sandwich(problem: &Collinearity<'_>, at: &Outcome<View>, a_inverse: &DMatrix<f64>) -> Result<DMatrix<f64>> {
-    let u = problem.free.len();
-    let rows = problem.all_rows(&at.state).ok_or_else(|| Error::Internal("a fitted point is not visible".into()))?;
-    let n = problem.observations.len();
-    let mut b = DMatrix::<f64>::zeros(u, u);
-    for i in 0..n {
-        let (p, q) = (&rows[2 * i], &rows[2 * i + 1]);
-        let (_, weight) = problem.loss.at((p.1 * p.1 + q.1 * q.1) / (problem.scale * problem.scale));
-        let pull: Vec<f64> = (0..u).map(|k| weight * (p.0[k] * p.1 + q.0[k] * q.1)).collect();
-        for k in 0..u {
-            for l in 0..u {
-                b[(k, l)] += pull[k] * pull[l];
-            }
-        }
-    }
-    for (row, _) in &rows[2 * n..] {
-        for k in 0..u {
-            for l in 0..u {
-                b[(k, l)] += row[k] * row[l];
-            }
-        }
-    }
-    let n2 = 2.0 * n as f64;
-    let lost = n2 / (n2 - u as f64).max(1.0);
-    Ok(a_inverse * b * a_inverse * lost)
-}
-
-/// A prior as a term of the problem; held ones keep only their value.
-fn resolve(prior: &Prior, free: &FreeSet, view: &View, origin: &Vector3<f64>) -> Result<PriorTerm> {
-    let Prior { name, value, sigma } = prior;
-    if !value.is_finite() || !sigma.is_finite() || *sigma < 0.0 {
-        return Err(Error::invalid(format!("prior of `{name}`: {value} ± {sigma} is not possible")));
-    }
-    let place = match free.position(name) {
-        Some(place) => place,
-        None if *sigma == 0.0 => {
-            // Held and not free: the value must still be one that the view has.
-            FreeSet::parse(view.camera.model(), &[name])?;
-            0
-        }
-        None => {
-            return Err(Error::invalid(format!(
-                "`{name}` has a prior with a sigma, but is not free: the free parameters are {}",
-                free.names().join(" ")
-            )));
-        }
-    };
-    let shift = ["cx_world", "cy_world", "cz_world"].iter().position(|n| n == name).map_or(0.0, |k| origin[k]);
-    Ok(PriorTerm { place, value: value - shift, sigma: *sigma })
-}
-
-/// The view with parameters set to values (local frame).
-fn set_values(view: &View, values: &[(String, f64)], reference: &Matrix3<f64>) -> Result<View> {
-    let mut view = *view;
-    let mut turn = Vector3::zeros();
-    let mut turns = false;
-    for (name, value) in values {
-        if let Some(axis) = ["rx", "ry", "rz"].iter().position(|n| n == name) {
-            turn[axis] = *value;
-            turns = true;
-            continue;
-        }
-        let one = FreeSet::parse(view.camera.model(), &[name])?;
-        if one.len() != 1 {
-            return Err(Error::invalid(format!(
-                "`{name}` is a group: give a prior for each of {}",
-                one.names().join(" ")
-            )));
-        }
-        view = one.apply(&view, &[value - one.values(&view)[0]])?;
-    }
-    if turns {
-        view.pose.rotation = rotation_exp(&turn) * reference;
-    }
-    Ok(view)
 }

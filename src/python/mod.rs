@@ -39,7 +39,6 @@ fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
     estimation::register(m)?;
     dlt::register(m)?;
     matching::register(m)?;
-    estimation::register(m)?;
     icp::register(m)?;
     neighbours::register(m)?;
     similarity::register(m)?;

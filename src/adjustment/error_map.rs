@@ -5,7 +5,7 @@ use rayon::prelude::*;
 
 use super::view_covariance::ViewCovariance;
 use crate::error::{Error, Result};
-use crate::geometry::{Depth, View};
+use crate::geometry::{Depth, View, tangents};
 
 /// The predicted error of one place of the photo at one depth, by the view's covariance alone.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -58,9 +58,7 @@ pub(super) fn across_the_ray(
     d_xyz: &Matrix2x3<f64>,
     direction: &Vector3<f64>,
 ) -> Option<Matrix3<f64>> {
-    let helper = if direction.x.abs() < 0.6 { Vector3::x() } else { Vector3::y() };
-    let e1 = direction.cross(&helper).normalize();
-    let e2 = direction.cross(&e1);
+    let (e1, e2) = tangents(direction);
     let basis = nalgebra::Matrix3x2::from_columns(&[e1, e2]);
     let to_object = basis * (d_xyz * basis).try_inverse()?;
     Some(to_object * pixel * to_object.transpose())

@@ -4,7 +4,7 @@ use nalgebra::Vector3;
 
 use super::surface::{MOST, Sample, Surface, Tolerance, surface};
 use super::{BackprojectOptions, Backprojected, DepthImage, Origin, TILE, direction, point};
-use crate::geometry::{Camera, Depth, View};
+use crate::geometry::{Camera, Depth, View, tangents};
 
 /// What curvature may do to a depth over one pixel, in pixels' sizes on the surface.
 const CURVATURE: f64 = 0.05;
@@ -214,9 +214,8 @@ impl Basis {
         let across = match kind {
             Depth::AlongAxis => [Vector3::x(), Vector3::y()],
             Depth::Range => {
-                let helper = if ray.x.abs() < 0.6 { Vector3::x() } else { Vector3::y() };
-                let first = ray.cross(&helper).normalize();
-                [first, ray.cross(&first)]
+                let (first, second) = tangents(&ray);
+                [first, second]
             }
         };
         Self { ray, kind, across, pixel }

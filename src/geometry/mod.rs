@@ -10,6 +10,7 @@ mod pose;
 mod project;
 mod roots;
 mod similarity;
+mod tangents;
 mod view;
 
 pub use block::{Block, BlockProjector, LANES};
@@ -19,4 +20,5 @@ pub use frustum::Frustum;
 pub use pose::{Pose, rotation_exp, rotation_log, skew_matrix};
 pub use project::{ViewJacobian, project, project_into, unproject};
 pub use similarity::Similarity;
+pub use tangents::tangents;
 pub use view::{DltParts, View};

@@ -11,6 +11,7 @@ use super::material::Spot;
 use super::noise::{fractal, smoothstep, split};
 use super::scene::Scene;
 use super::shape::Outline;
+use crate::geometry::tangents;
 
 /// Cells of a light map along one side of a primitive, at most.
 const MOST_CELLS: usize = 36;
@@ -153,13 +154,6 @@ fn hemisphere(n: usize) -> Vec<Vector3<f64>> {
             Vector3::new(radius * angle.cos(), radius * angle.sin(), (1.0 - a).sqrt())
         })
         .collect()
-}
-
-/// Two unit vectors across `normal`.
-fn tangents(normal: &Vector3<f64>) -> (Vector3<f64>, Vector3<f64>) {
-    let helper = if normal.z.abs() > 0.9 { Vector3::x() } else { Vector3::z() };
-    let across = helper.cross(normal).normalize();
-    (across, normal.cross(&across))
 }
 
 impl LightMap {

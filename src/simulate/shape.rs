@@ -2,6 +2,8 @@
 
 use nalgebra::Vector3;
 
+use crate::geometry::tangents;
+
 /// What outline a primitive has.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Outline {
@@ -83,9 +85,8 @@ impl Primitive {
                 if v.x < 0.0 || v.y < 0.0 || v.x + v.y <= 0.0 {
                     return None;
                 }
-                let helper = if axis.z.abs() > 0.9 { Vector3::x() } else { Vector3::z() };
-                let across = helper.cross(&axis).normalize();
-                (axis, [across, axis.cross(&across)])
+                let (first, second) = tangents(&axis);
+                (axis, [first, second])
             }
             _ => {
                 let normal = u.cross(&v);

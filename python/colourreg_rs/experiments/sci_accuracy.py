@@ -209,7 +209,7 @@ def main() -> None:
     """Prints both tables."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--scene", action="append", help="facade, room, square, corner; several times for several")
-    parser.add_argument("--seeds", default="10", help="how many, or FIRST:LAST")
+    parser.add_argument("--seeds", default="10", help="how many, or FIRST:END, without END itself")
     parser.add_argument("--size", default="1200x800", help="of the photos")
     parser.add_argument("--cache", type=Path, help="a folder that keeps the simulations")
     arguments = parser.parse_args()

@@ -204,7 +204,7 @@ def sci(
     view: Annotated[Path, typer.Option(help="A registration with the view to render (JSON).")],
     out: Annotated[Path, typer.Option(help="Folder for the pictures.")],
     bits: Annotated[int, typer.Option(help="Of the intensity picture: 8 or 16.")] = 8,
-    fill: Annotated[int, typer.Option(help="The widest hole to be filled, pixels; 0 fills none.")] = 8,
+    fill: Annotated[int, typer.Option(help="The widest hole to be filled, pixels; 0 fills none.", min=0, max=256)] = 8,
     tolerance: ToleranceOption = None,
     json_file: JsonOption = None,
 ) -> None:

@@ -15,6 +15,7 @@ from colourreg_rs.io.clouds import open_cloud, read_cloud, write_cloud
 from colourreg_rs.io.images import read_photo, write_image
 from colourreg_rs.io.points import read_points, write_points
 from colourreg_rs.io.registration import read_registration, write_camera
+from colourreg_rs.register import RegisterOptions, register_photo
 
 CAMERA = Camera("OPENCV", 600, 400, {"fx": 500.0, "fy": 500.0, "cx": 299.5, "cy": 199.5, "k1": -0.04})
 POSE = Pose.looking_at([500_000.0, 5_800_000.0, 102.0], [500_001.0, 5_800_010.0, 103.0])
@@ -217,6 +218,41 @@ def test_pictures_of_several_views_stay_in_their_folder(job, tmp_path):
     assert done.returncode == 0, done.stderr
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["in"]
     assert len(list((tmp_path / "out" / "in").glob("*/view.json"))) == 3
+
+
+def test_a_lens_taken_as_free_of_distortion_is_suspected(job, tmp_path):
+    """Good points are rejected then, the others fit, and the check points tell; with the lens known nothing is said."""
+    lens = CAMERA.with_params(fx=520.0, fy=520.0, k1=-0.2)
+    rng = np.random.default_rng(8)
+    pixels = rng.uniform([5, 5], [595, 395], (22, 2))
+    depths = rng.uniform(7.0, 12.0, 22)
+    plain = View("photo", None, replace(CAMERA, params={**lens.params, "k1": 0.0}), POSE)
+    rays = np.column_stack([(pixels - [299.5, 199.5]) / 520.0, np.ones(22)]) * depths[:, None]
+    xyz = (rays - POSE.translation) @ POSE.rotation
+    assert np.allclose(_core.project(plain.core, xyz)[0], pixels, atol=1e-4)
+    xy, _ = _core.project(View("photo", None, lens, POSE).core, xyz)
+    sigma = np.array([0.3, 0.3])
+    points = [
+        ControlPoint(f"T{i}", a, b, "check" if i % 4 == 3 else "control", None, sigma)
+        for i, (a, b) in enumerate(zip(xyz, xy + rng.normal(0, 0.3, xy.shape), strict=True))
+    ]
+    write_points(tmp_path / "points.csv", points)
+    write_camera(tmp_path / "lens.json", lens)
+    arguments = {"cloud": job / "scan.laz", "photo": job / "photo.png", "points": tmp_path / "points.csv"}
+    for free in (None, ("pose", "f", "k1")):
+        said = " ".join(register_photo(**arguments, options=RegisterOptions(free=free)).warnings)
+        assert ("--free pose,f,k1" in said) == (free is None)
+    assert "check points are off" not in said
+    assert "--camera" not in " ".join(register_photo(**arguments, camera=tmp_path / "lens.json").warnings)
+
+
+def test_photos_that_need_a_colour_profile_are_refused_at_once(job, tmp_path):
+    from PIL import Image
+
+    with Image.open(job / "photo.png") as image:
+        image.convert("CMYK").save(tmp_path / "photo.jpg")
+    done = colourreg(*REGISTER[:2], tmp_path / "photo.jpg", *REGISTER[3:], "--out", "x.json", cwd=job)
+    assert done.returncode == 1 and "CMYK" in done.stderr and done.stderr.count("\n") == 1
 
 
 def _without_cloud(view):

@@ -139,7 +139,7 @@ def assess_view(view: View, points: Sequence[ControlPoint] | None = None) -> Vie
         view=view,
         evaluation=evaluation,
         adjustment=adjustment,
-        check=_check(view, [*[p for p in view.points if p.role == "check"], *checks], adjustment),
+        check=check_test(view, [*[p for p in view.points if p.role == "check"], *checks], adjustment),
         error_map=error_map(view, depth) if np.isfinite(depth) else None,
         next_points=next_points(view, depths, adjustment),
         pixels_per_radian=pixels_per_radian(view),
@@ -162,7 +162,7 @@ def _took_part(view: View, point: ControlPoint) -> bool:
     )
 
 
-def _check(view: View, points: Sequence[ControlPoint], adjustment: dict[str, Any] | None) -> dict[str, Any] | None:
+def check_test(view: View, points: Sequence[ControlPoint], adjustment: dict[str, Any] | None) -> dict[str, Any] | None:
     """The check points against what the covariance promises: probabilities of differences as large by chance. Where a
     few are off by themselves, and no more than a fifth, the others are judged together again, without them."""
     found = _tested(view, points, adjustment)

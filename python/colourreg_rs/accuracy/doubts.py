@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..model import ControlPoint, View
+from .assessment import CHECK_ALPHA, check_test
 
 #: A check point farther off than this many times the fit's own RMS, and than this share of the photo's diagonal,
 #: contradicts the view.
@@ -21,6 +22,9 @@ FLAT = 0.02
 
 #: From this share of rejected control points on, and with fewer than so many left, the list contradicts itself.
 REJECTED, FEW_LEFT = 0.5, 30
+
+#: From this share on, rejected control points may be good ones seen through a lens that is not known.
+MANY_REJECTED = 0.25
 
 
 def contradictions(view: View) -> tuple[str, ...]:
@@ -47,6 +51,33 @@ def contradictions(view: View) -> tuple[str, ...]:
                 f" middle one by {typical}), while the control points fit to {rms:.2f} px: they do not belong together"
             )
     return tuple(reasons)
+
+
+def suspicions(view: View, unknown_distortion: bool) -> tuple[str, ...]:
+    """What is to be read before the view is used: its points leave it, but not so far that it must be wrong.
+
+    ``unknown_distortion``: the lens was neither calibrated nor are its terms estimated. Taken as free of distortion, it
+    makes good points look like blunders, and those that are left fit well.
+    """
+    found = []
+    control = [p for p in view.points if p.role == "control"]
+    rejected = sum(p.status == "rejected" for p in control)
+    checks = [p for p in view.points if p.role == "check" and p.residual_xy is not None]
+    tested = check_test(view, checks, view.statistics.get("adjustment"))
+    p_value = tested["joint_p_value"] if tested is not None else None
+    if p_value is not None and p_value < CHECK_ALPHA:
+        off = np.sqrt(np.mean([np.sum(np.square(p.residual_xy)) for p in checks if p.residual_xy is not None]))
+        found.append(
+            f"the {len(checks)} check points are off by {off:.2f} px (radial RMS), more than the covariance explains "
+            f"(p = {p_value:.2g}): the view is worse than it says"
+        )
+    if unknown_distortion and (found or (rejected >= 3 and rejected >= MANY_REJECTED * len(control))):
+        lost = f"{rejected} of {len(control)} control points were rejected: " if rejected else ""
+        found.append(
+            f"{lost}a lens whose distortion is not known looks like this: give its calibration with --camera, or "
+            "estimate it with --free pose,f,k1"
+        )
+    return tuple(found)
 
 
 def _mirrored(control: Sequence[ControlPoint]) -> list[str]:

@@ -89,11 +89,12 @@ def whole_photo_info(path: str | Path) -> PhotoInfo:
     TIFF must lie in the file.
 
     Raises:
-        FileError: as :func:`photo_info`, and where the file is cut off or does not decode.
+        FileError: as :func:`photo_info`, and where the file is cut off, does not decode, or is CMYK or the like.
     """
     path = Path(path)
     with open_binary(path) as file, _opened(path, file) as image:
         info = _info(path, file, image)
+        _refuse_mode(path, image.mode)
         if info.format == "JPEG":
             image.draft(image.mode, (image.width // 8, image.height // 8))
             image.load()
@@ -353,11 +354,15 @@ def _exif_block(values: Mapping[str, Any]) -> Image.Exif:
     return exif
 
 
+def _refuse_mode(path: Path, mode: str) -> None:
+    if mode in ("CMYK", "LAB", "HSV"):
+        raise FileError(path, f"is in {mode}, which needs a colour profile to become RGB", "export it as RGB")
+
+
 def _eight_bits(path: Path, image: Image.Image) -> npt.NDArray[np.uint8]:
     """(H, W, C) as it is stored."""
     mode = image.mode
-    if mode in ("CMYK", "LAB", "HSV"):
-        raise FileError(path, f"is in {mode}, which needs a colour profile to become RGB", "export it as RGB")
+    _refuse_mode(path, mode)
     if mode in ("I", "F", "I;16", "I;16B", "I;16L", "I;16N"):
         raise FileError(path, f"has pixels of an unusual kind ({mode})", _EXPORT)
     if mode == "LA" or mode == "1":

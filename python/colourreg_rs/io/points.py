@@ -24,8 +24,8 @@ IMAGE_SIGMAS = ("sx", "sy")
 COLUMNS = (*REQUIRED, "role", *OBJECT_SIGMAS, *IMAGE_SIGMAS)
 
 _LIMIT = 1 << 26
-_POINT = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
-_COMMA = re.compile(r"[+-]?(\d+,\d*|,\d+)([eE][+-]?\d+)?")
+_POINT = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+_COMMA = re.compile(r"[+-]?(\d+,\d*|,\d+)([eE][+-]?\d+)?", re.ASCII)
 
 
 def read_points(path: str | Path) -> list[ControlPoint]:

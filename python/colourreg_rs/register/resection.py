@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from .. import _core
-from ..accuracy.doubts import contradictions
+from ..accuracy.doubts import contradictions, suspicions
 from ..accuracy.view_adjustment import AdjustedView, PointSigmas, adjust_control, rotation_priors
 from ..errors import DegenerateError, NotConvergedError
 from ..evaluate import evaluate_view
@@ -62,6 +63,8 @@ def by_resection(
         points=adjusted.points if adjusted else judged_points(control, rough),
         statistics=adjusted.statistics if adjusted else statistics_of(rough),
     )
+    plain = not start.calibrated and not any(name == "distortion" or re.fullmatch(r"[kp]\d", name) for name in free)
+    warnings = (*warnings, *suspicions(view, unknown_distortion=plain))
     notes = [f"{start.origin}; free: {', '.join(free)}", sigmas.describe()]
     if options.loss is not None:
         notes[1:] = [_of_loss(options.loss, sigmas)]

@@ -180,10 +180,12 @@ def sci_resample(
     *,
     sigma: float = 0.7,
     widest: float = 4.0,
+    gaps: bool = False,
 ) -> npt.NDArray[np.float32]:
     """Values (H, W) of points that lie ``offset`` (H, W, 2) beside their pixels' centres, brought to the centres of all
     pixels with an inverse depth: a plane through the neighbours at their true places, weighted by a Gaussian of
-    ``sigma`` px, twice as wide where none is near, up to ``widest``. NaN elsewhere."""
+    ``sigma`` px, twice as wide where none is near, up to ``widest``. NaN elsewhere, and with ``gaps`` also where there
+    is a point of the pixel's own."""
 
 def fit_exponents(
     intensity: npt.NDArray[np.float32], range: npt.NDArray[np.float32], cosine: npt.NDArray[np.float32] | None = None

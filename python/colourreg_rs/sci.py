@@ -177,7 +177,7 @@ def render_sci(
         filled = _core.sci_fill(inverse, limit, width=fill, wraps=wraps)
         holes = (filled > 0) & ~measured
         if source is not None and holes.any():
-            at_centres = _core.sci_resample(value, offset, filled, sigma=CENTRE_SIGMA, widest=float(fill))
+            at_centres = _core.sci_resample(value, offset, filled, sigma=CENTRE_SIGMA, widest=float(fill), gaps=True)
             value[holes] = at_centres[holes]
             filled[holes & ~np.isfinite(value)] = 0.0
     else:

@@ -129,6 +129,9 @@ pub fn regress_patches(
     if !patches.iter().all(|p| p.iter().all(known)) {
         return Err(Error::invalid(format!("a patch names a point that is none of the {}", xy.len())));
     }
+    // Patches of several layouts share their points.
+    let read: Vec<_> = xy.par_iter().map(|[x, y]| photo.read(*x, *y)).collect();
+    let channels = photo.planes.len();
     Ok(patches
         .par_iter()
         .map(|members| {
@@ -143,13 +146,23 @@ pub fn regress_patches(
                         return None;
                     }
                     let mut terms = [[0.0; 3]; REGRESSORS];
-                    terms[..CHANNELS].copy_from_slice(&photo.read(x, y)?);
+                    terms[..CHANNELS].copy_from_slice(&read[i]?);
                     Some(Point { at: [x, y], terms, value, design })
                 })
                 .collect();
-            let channels = photo.planes.len();
             let terms = add_polynomial(&mut points, channels, options.order);
-            regress(&points, parameters, [channels, terms], options)
+            // Loops of known lengths take half the time.
+            match terms {
+                1 => regress::<1>(&points, parameters, channels, options),
+                2 => regress::<2>(&points, parameters, channels, options),
+                3 => regress::<3>(&points, parameters, channels, options),
+                4 => regress::<4>(&points, parameters, channels, options),
+                5 => regress::<5>(&points, parameters, channels, options),
+                6 => regress::<6>(&points, parameters, channels, options),
+                7 => regress::<7>(&points, parameters, channels, options),
+                8 => regress::<8>(&points, parameters, channels, options),
+                _ => regress::<REGRESSORS>(&points, parameters, channels, options),
+            }
         })
         .collect())
 }
@@ -180,21 +193,27 @@ struct Point<'a> {
     design: &'a [f64],
 }
 
+impl Point<'_> {
+    /// The values of the first T regressors less their means.
+    fn centred<const T: usize>(&self, mean: &[f64; T]) -> [f64; T] {
+        std::array::from_fn(|c| self.terms[c][0] - mean[c])
+    }
+}
+
 /// The regression of a patch at given weights.
-struct Fit {
+struct Fit<const T: usize> {
     count: f64,
-    mean: [f64; REGRESSORS],
-    coefficients: [f64; REGRESSORS],
-    inverse: [[f64; REGRESSORS]; REGRESSORS],
+    mean: [f64; T],
+    coefficients: [f64; T],
+    inverse: [[f64; T]; T],
     residuals: Vec<f64>,
     /// Σ w r², and Σ w (I - mean)².
     left: f64,
     whole: f64,
 }
 
-/// Of the regressors in use, `counts`, the first are the photo's channels.
-fn regress(points: &[Point], parameters: usize, counts: [usize; 2], options: &RegressionOptions) -> Patch {
-    let [_, terms] = counts;
+/// Of the T regressors in use the first are the photo's `channels`.
+fn regress<const T: usize>(points: &[Point], parameters: usize, channels: usize, options: &RegressionOptions) -> Patch {
     let silent = |points: f64| Patch {
         gradient: vec![0.0; parameters],
         information: vec![0.0; parameters * parameters],
@@ -202,11 +221,11 @@ fn regress(points: &[Point], parameters: usize, counts: [usize; 2], options: &Re
         explained: 0.0,
         points,
     };
-    if points.len() < options.least_points.max(terms + 2) {
+    if points.len() < options.least_points.max(T + 2) {
         return silent(points.len() as f64);
     }
     let mut weights = vec![1.0; points.len()];
-    let mut fit = fitted(points, &weights, counts, options.ridge);
+    let mut fit = fitted::<T>(points, &weights, channels, options.ridge);
     if options.cut.is_finite() {
         for _ in 0..3 {
             let Some(found) = &fit else { break };
@@ -218,7 +237,7 @@ fn regress(points: &[Point], parameters: usize, counts: [usize; 2], options: &Re
                 let t = (r / scale).powi(2);
                 *w = if t < 1.0 { (1.0 - t).powi(2) } else { 0.0 };
             }
-            fit = fitted(points, &weights, counts, options.ridge);
+            fit = fitted::<T>(points, &weights, channels, options.ridge);
         }
     }
     let Some(fit) = fit else { return silent(points.len() as f64) };
@@ -233,7 +252,7 @@ fn regress(points: &[Point], parameters: usize, counts: [usize; 2], options: &Re
     let mut mean = vec![0.0; parameters];
     for (p, w) in points.iter().zip(&weights) {
         let (mut by_x, mut by_y) = (0.0, 0.0);
-        for (c, b) in p.terms.iter().zip(&fit.coefficients).take(terms) {
+        for (c, b) in p.terms.iter().zip(&fit.coefficients) {
             by_x += b * c[1];
             by_y += b * c[2];
         }
@@ -244,23 +263,25 @@ fn regress(points: &[Point], parameters: usize, counts: [usize; 2], options: &Re
             *m += w * s / fit.count;
         }
     }
-    let mut with_terms = vec![[0.0; REGRESSORS]; parameters];
+    let mut with_terms = vec![[0.0; T]; parameters];
     for ((p, w), s) in points.iter().zip(&weights).zip(slopes.chunks_exact_mut(parameters)) {
+        let centred: [f64; T] = p.centred(&fit.mean);
         for ((s, m), sum) in s.iter_mut().zip(&mean).zip(&mut with_terms) {
             *s -= m;
-            for c in 0..terms {
-                sum[c] += w * *s * (p.terms[c][0] - fit.mean[c]);
+            for c in 0..T {
+                sum[c] += w * *s * centred[c];
             }
         }
     }
-    let taken: Vec<[f64; REGRESSORS]> = with_terms.iter().map(|sum| times(&fit.inverse, sum)).collect();
+    let taken: Vec<[f64; T]> = with_terms.iter().map(|sum| times(&fit.inverse, sum)).collect();
     let mut gradient = vec![0.0; parameters];
     let mut information = vec![0.0; parameters * parameters];
     for (i, (p, w)) in points.iter().zip(&weights).enumerate() {
         let s = &mut slopes[i * parameters..(i + 1) * parameters];
+        let centred: [f64; T] = p.centred(&fit.mean);
         for (s, t) in s.iter_mut().zip(&taken) {
-            for c in 0..terms {
-                *s -= t[c] * (p.terms[c][0] - fit.mean[c]);
+            for c in 0..T {
+                *s -= t[c] * centred[c];
             }
         }
         let weight = w / variance;
@@ -280,27 +301,28 @@ fn regress(points: &[Point], parameters: usize, counts: [usize; 2], options: &Re
     Patch { gradient, information, value, explained, points: fit.count }
 }
 
-fn fitted(points: &[Point], weights: &[f64], [channels, terms]: [usize; 2], ridge: f64) -> Option<Fit> {
+fn fitted<const T: usize>(points: &[Point], weights: &[f64], channels: usize, ridge: f64) -> Option<Fit<T>> {
     let count: f64 = weights.iter().sum();
-    if count <= terms as f64 + 1.0 {
+    if count <= T as f64 + 1.0 {
         return None;
     }
-    let (mut mean, mut middle) = ([0.0; REGRESSORS], 0.0);
+    let (mut mean, mut middle) = ([0.0; T], 0.0);
     for (p, w) in points.iter().zip(weights) {
         middle += w * p.value / count;
-        for c in 0..terms {
+        for c in 0..T {
             mean[c] += w * p.terms[c][0] / count;
         }
     }
-    let (mut normal, mut right, mut whole) = ([[0.0; REGRESSORS]; REGRESSORS], [0.0; REGRESSORS], 0.0);
+    let (mut normal, mut right, mut whole) = ([[0.0; T]; T], [0.0; T], 0.0);
     for (p, w) in points.iter().zip(weights) {
         let value = p.value - middle;
         whole += w * value * value;
-        for a in 0..terms {
-            let pa = p.terms[a][0] - mean[a];
-            right[a] += w * pa * value;
-            for b in 0..=a {
-                normal[a][b] += w * pa * (p.terms[b][0] - mean[b]);
+        let centred: [f64; T] = p.centred(&mean);
+        for a in 0..T {
+            let weighted = w * centred[a];
+            right[a] += weighted * value;
+            for b in 0..T {
+                normal[a][b] += weighted * centred[b];
             }
         }
     }
@@ -308,23 +330,19 @@ fn fitted(points: &[Point], weights: &[f64], [channels, terms]: [usize; 2], ridg
     if !(trace > 0.0 && whole > 0.0) {
         return None;
     }
-    for a in 0..REGRESSORS {
+    for a in 0..T {
         for b in 0..a {
             normal[b][a] = normal[a][b];
         }
-        // Regressors that are not in use are independent of all others.
-        normal[a][a] = match a {
-            a if a < channels => normal[a][a] + ridge * trace,
-            a if a < terms => (1.0 + 1e-6) * normal[a][a] + 1e-6,
-            _ => 1.0,
-        };
+        normal[a][a] = if a < channels { normal[a][a] + ridge * trace } else { (1.0 + 1e-6) * normal[a][a] + 1e-6 };
     }
     let inverse = inverted(normal)?;
     let coefficients = times(&inverse, &right);
     let residuals: Vec<f64> = points
         .iter()
         .map(|p| {
-            let explained: f64 = (0..terms).map(|c| coefficients[c] * (p.terms[c][0] - mean[c])).sum();
+            let centred: [f64; T] = p.centred(&mean);
+            let explained: f64 = coefficients.iter().zip(centred).map(|(b, c)| b * c).sum();
             p.value - middle - explained
         })
         .collect();
@@ -339,25 +357,25 @@ fn robust_sigma(residuals: &[f64]) -> f64 {
     if sizes.is_empty() { 0.0 } else { 1.4826 * *sizes.select_nth_unstable_by(middle, f64::total_cmp).1 }
 }
 
-fn times(m: &[[f64; REGRESSORS]; REGRESSORS], v: &[f64; REGRESSORS]) -> [f64; REGRESSORS] {
+fn times<const T: usize>(m: &[[f64; T]; T], v: &[f64; T]) -> [f64; T] {
     std::array::from_fn(|a| m[a].iter().zip(v).map(|(m, v)| m * v).sum())
 }
 
 /// Inverse of a symmetric positive definite matrix by Gauss–Jordan elimination; `None` where it is none.
-fn inverted(mut m: [[f64; REGRESSORS]; REGRESSORS]) -> Option<[[f64; REGRESSORS]; REGRESSORS]> {
-    let mut out: [[f64; REGRESSORS]; REGRESSORS] = std::array::from_fn(|a| std::array::from_fn(|b| f64::from(a == b)));
-    for a in 0..REGRESSORS {
+fn inverted<const T: usize>(mut m: [[f64; T]; T]) -> Option<[[f64; T]; T]> {
+    let mut out: [[f64; T]; T] = std::array::from_fn(|a| std::array::from_fn(|b| f64::from(a == b)));
+    for a in 0..T {
         let pivot = m[a][a];
         if !(pivot > 0.0 && pivot.is_finite()) {
             return None;
         }
-        for b in 0..REGRESSORS {
+        for b in 0..T {
             m[a][b] /= pivot;
             out[a][b] /= pivot;
         }
-        for r in (0..REGRESSORS).filter(|r| *r != a) {
+        for r in (0..T).filter(|r| *r != a) {
             let factor = m[r][a];
-            for b in 0..REGRESSORS {
+            for b in 0..T {
                 m[r][b] -= factor * m[a][b];
                 out[r][b] -= factor * out[a][b];
             }

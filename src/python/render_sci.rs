@@ -97,7 +97,7 @@ fn sci_fill<'py>(
 }
 
 #[pyfunction]
-#[pyo3(signature = (values, offset, inverse_depth, *, sigma=0.7, widest=4.0))]
+#[pyo3(signature = (values, offset, inverse_depth, *, sigma=0.7, widest=4.0, gaps=false))]
 fn sci_resample<'py>(
     py: Python<'py>,
     values: &Bound<'py, PyAny>,
@@ -105,6 +105,7 @@ fn sci_resample<'py>(
     inverse_depth: &Bound<'py, PyAny>,
     sigma: f32,
     widest: f32,
+    gaps: bool,
 ) -> PyResult<Bound<'py, PyArray2<f32>>> {
     let values = Input::<f32>::new(values, "values", &[None, None])?;
     let (height, width) = (values.shape()[0], values.shape()[1]);
@@ -117,7 +118,7 @@ fn sci_resample<'py>(
         offsets: offset.rows::<2>()?,
         inverse_depth: inverse_depth.values()?,
     };
-    let out = py.detach(|| resampled(&image, sigma, widest));
+    let out = py.detach(|| resampled(&image, sigma, widest, gaps));
     owned(py, out, [height, width])
 }
 

@@ -25,15 +25,21 @@ pub struct Scattered<'a> {
 const STEP: f32 = 0.02;
 
 /// The value at each pixel's centre; NaN where nothing was measured or filled, or no neighbour is near. `sigma` is that
-/// of the Gaussian, px; pixels whose neighbours are farther away are reached by a wider one, up to `widest`.
-pub fn resampled(image: &Scattered, sigma: f32, widest: f32) -> Vec<f32> {
+/// of the Gaussian, px; pixels whose neighbours are farther away are reached by a wider one, up to `widest`. With `gaps`
+/// only pixels without a point of their own are asked for; the others are NaN.
+pub fn resampled(image: &Scattered, sigma: f32, widest: f32, gaps: bool) -> Vec<f32> {
+    if image.width == 0 {
+        return Vec::new();
+    }
+    let measured = Measured::of(image);
     let mut out = vec![f32::NAN; image.width * image.height];
     out.par_chunks_mut(image.width).enumerate().for_each(|(y, row)| {
         for (x, value) in row.iter_mut().enumerate() {
-            if image.inverse_depth[y * image.width + x] > 0.0 {
+            let i = y * image.width + x;
+            if image.inverse_depth[i] > 0.0 && !(gaps && measured.has(x, y)) {
                 let mut s = sigma;
                 loop {
-                    if let Some(v) = fit(image, x, y, s) {
+                    if let Some(v) = fit(image, &measured, x, y, s) {
                         *value = v;
                         break;
                     }
@@ -48,33 +54,63 @@ pub fn resampled(image: &Scattered, sigma: f32, widest: f32) -> Vec<f32> {
     out
 }
 
-fn fit(image: &Scattered, x: usize, y: usize, sigma: f32) -> Option<f32> {
-    let reach = (2.2 * sigma + 0.5).ceil() as isize;
-    let (w, h) = (image.width as isize, image.height as isize);
+/// Which pixels have a point of their own, a bit for each: in a sparse image most of a neighbourhood has none.
+struct Measured {
+    words: usize,
+    bits: Vec<u64>,
+}
+
+impl Measured {
+    fn of(image: &Scattered) -> Self {
+        let words = image.width.div_ceil(64);
+        let mut bits = vec![0u64; words * image.height];
+        bits.par_chunks_mut(words).zip(image.offsets.par_chunks(image.width)).for_each(|(bits, row)| {
+            for (word, pixels) in bits.iter_mut().zip(row.chunks(64)) {
+                *word = pixels.iter().enumerate().fold(0, |w, (k, o)| w | (u64::from(!o[0].is_nan()) << k));
+            }
+        });
+        Self { words, bits }
+    }
+
+    fn has(&self, x: usize, y: usize) -> bool {
+        self.bits[y * self.words + x / 64] >> (x % 64) & 1 == 1
+    }
+
+    /// Calls `f` with the measured columns of row `y` from `first` to `last`, in this order.
+    fn columns(&self, y: usize, first: usize, last: usize, mut f: impl FnMut(usize)) {
+        let row = &self.bits[y * self.words..(y + 1) * self.words];
+        for (k, &word) in row.iter().enumerate().take(last / 64 + 1).skip(first / 64) {
+            let mut rest = word;
+            if k == first / 64 {
+                rest &= u64::MAX << (first % 64);
+            }
+            if k == last / 64 {
+                rest &= u64::MAX >> (63 - last % 64);
+            }
+            while rest != 0 {
+                f(64 * k + rest.trailing_zeros() as usize);
+                rest &= rest - 1;
+            }
+        }
+    }
+}
+
+fn fit(image: &Scattered, measured: &Measured, x: usize, y: usize, sigma: f32) -> Option<f32> {
+    let reach = (2.2 * sigma + 0.5).ceil() as usize;
     let here = image.inverse_depth[y * image.width + x];
     let scale = -0.5 / (sigma * sigma);
     let (mut s, mut sx, mut sy, mut sxx, mut sxy, mut syy) = (0.0f32, 0.0, 0.0, 0.0, 0.0, 0.0);
     let (mut sv, mut svx, mut svy) = (0.0f32, 0.0, 0.0);
-    for dy in -reach..=reach {
-        let v = y as isize + dy;
-        if v < 0 || v >= h {
-            continue;
-        }
-        for dx in -reach..=reach {
-            let u = x as isize + dx;
-            if u < 0 || u >= w {
-                continue;
-            }
-            let i = (v * w + u) as usize;
-            let [ox, oy] = image.offsets[i];
-            if ox.is_nan() {
-                continue;
-            }
-            let steps = dx.abs().max(dy.abs()).max(1) as f32;
+    let (left, right) = (x.saturating_sub(reach), (x + reach).min(image.width - 1));
+    for v in y.saturating_sub(reach)..=(y + reach).min(image.height - 1) {
+        measured.columns(v, left, right, |u| {
+            let i = v * image.width + u;
+            let steps = u.abs_diff(x).max(v.abs_diff(y)).max(1) as f32;
             if (image.inverse_depth[i] - here).abs() > STEP * steps * here {
-                continue;
+                return;
             }
-            let (px, py) = (dx as f32 + ox, dy as f32 + oy);
+            let [ox, oy] = image.offsets[i];
+            let (px, py) = ((u as f32 - x as f32) + ox, (v as f32 - y as f32) + oy);
             let weight = (scale * (px * px + py * py)).exp();
             let value = image.values[i];
             s += weight;
@@ -86,7 +122,7 @@ fn fit(image: &Scattered, x: usize, y: usize, sigma: f32) -> Option<f32> {
             sv += weight * value;
             svx += weight * px * value;
             svy += weight * py * value;
-        }
+        });
     }
     // Less than a sixth of one centred neighbour says nothing.
     if s < 0.16 {
@@ -133,7 +169,7 @@ mod tests {
             let inverse_depth = vec![0.1; 2000];
             let image =
                 Scattered { width: 50, height: 40, values: &values, offsets: &offsets, inverse_depth: &inverse_depth };
-            let out = resampled(&image, 0.7, 3.0);
+            let out = resampled(&image, 0.7, 3.0, false);
             let (mut torn, mut mended, mut n) = (0.0, 0.0, 0.0);
             for y in 4..36 {
                 for x in 4..46 {
@@ -145,6 +181,11 @@ mod tests {
                         n += 1.0;
                     }
                 }
+            }
+            // Asked for the gaps alone, these are the same.
+            for (i, v) in resampled(&image, 0.7, 3.0, true).iter().enumerate() {
+                let expected = if values[i].is_nan() { out[i] } else { f32::NAN };
+                assert!(v.to_bits() == expected.to_bits() || v.is_nan() && expected.is_nan());
             }
             let (torn, mended) = ((torn / n as f32).sqrt(), (mended / (32.0 * 42.0f32)).sqrt());
             assert!(mended < limit && mended < 0.6 * torn, "share {share}: torn {torn}, mended {mended}");
@@ -158,7 +199,7 @@ mod tests {
         let values: Vec<f32> = values.iter().enumerate().map(|(i, _)| if i % 50 < 25 { 0.0 } else { 100.0 }).collect();
         let image =
             Scattered { width: 50, height: 40, values: &values, offsets: &offsets, inverse_depth: &inverse_depth };
-        for (i, v) in resampled(&image, 0.8, 3.0).iter().enumerate() {
+        for (i, v) in resampled(&image, 0.8, 3.0, false).iter().enumerate() {
             let expected = if i % 50 < 25 { 0.0 } else { 100.0 };
             assert!((v - expected).abs() < 1e-3);
         }

@@ -14,11 +14,13 @@ Source of the region: χ² with six degrees of freedom of the error in the covar
 from __future__ import annotations
 
 import argparse
+import itertools
+import json
 import pickle
 import time
 import zlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -146,14 +148,40 @@ def register(case: Case, degrees: float, metres: float) -> tuple[Outcome, SciReg
 
 
 def run(
-    scenes: Sequence[str], seeds: Sequence[int], size: tuple[int, int], cache: Path | None = None
+    scenes: Sequence[str],
+    seeds: Sequence[int],
+    size: tuple[int, int],
+    cache: Path | None = None,
+    starts: Sequence[tuple[float, float]] = STARTS,
+    kept: Path | None = None,
 ) -> Iterator[Outcome]:
-    """All scenes, seeds and starts."""
-    for scene in scenes:
-        for seed in seeds:
-            case = simulated(scene, seed, size, cache)
-            for degrees, metres in STARTS:
-                yield register(case, degrees, metres)[0]
+    """All seeds, scenes and starts, in this order, so that what is there after an interruption has all kinds.
+
+    ``kept`` is a file to which every outcome is added, one a line, when it is there; those that it has are not made
+    again.
+    """
+    done = {} if kept is None or not kept.exists() else {_key(o): o for o in _read(kept)}
+    for seed, scene in itertools.product(seeds, scenes):
+        case = None
+        for degrees, metres in starts:
+            outcome = done.get((scene, seed, degrees, metres))
+            if outcome is None:
+                case = case or simulated(scene, seed, size, cache)
+                outcome = register(case, degrees, metres)[0]
+                if kept is not None:
+                    with kept.open("a", encoding="utf-8") as file:
+                        file.write(json.dumps(asdict(outcome)) + "\n")
+            yield outcome
+
+
+def _key(o: Outcome) -> tuple[str, int, float, float]:
+    return o.scene, o.seed, o.degrees, o.metres
+
+
+def _read(kept: Path) -> Iterator[Outcome]:
+    for text in kept.read_text(encoding="utf-8").splitlines():
+        fields = json.loads(text)
+        yield Outcome(**(fields | {"reasons": tuple(fields["reasons"])}))
 
 
 def line(o: Outcome) -> str:
@@ -211,14 +239,19 @@ def main() -> None:
     parser.add_argument("--scene", action="append", help="facade, room, square, corner; several times for several")
     parser.add_argument("--seeds", default="10", help="how many, or FIRST:END, without END itself")
     parser.add_argument("--size", default="1200x800", help="of the photos")
+    parser.add_argument("--start", type=float, action="append", help="0.5 or 3 degrees off; both unless one is given")
     parser.add_argument("--cache", type=Path, help="a folder that keeps the simulations")
+    parser.add_argument("--keep", type=Path, help="a file that keeps the outcomes: a run that was stopped goes on")
     arguments = parser.parse_args()
     width, height = (int(n) for n in arguments.size.split("x"))
+    wanted = arguments.start or [degrees for degrees, _ in STARTS]
+    starts = [start for start in STARTS if start[0] in wanted]
+    if len(starts) != len(set(wanted)):
+        parser.error(f"--start is one of {', '.join(f'{degrees:g}' for degrees, _ in STARTS)}")
+    scenes, seeds = arguments.scene or ["facade", "room"], _seeds(arguments.seeds)
     outcomes = []
     print(HEADER, flush=True)
-    for outcome in run(
-        arguments.scene or ["facade", "room"], _seeds(arguments.seeds), (width, height), arguments.cache
-    ):
+    for outcome in run(scenes, seeds, (width, height), arguments.cache, starts, arguments.keep):
         print(line(outcome), flush=True)
         for reason in outcome.reasons:
             print(f"    {reason}", flush=True)

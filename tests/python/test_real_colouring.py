@@ -185,3 +185,12 @@ def test_a_road_s_paint_is_bright_for_scanner_and_photo_alike(data_dir, tmp_path
     for axis in (0, 1):
         for degrees in (-0.5, 0.5):
             assert agreement(scenes.turned(given, axis, degrees)) < best - 0.1
+
+
+def test_a_road_scanned_in_a_few_lines_is_refused_by_the_sci(data_dir, tmp_path):
+    """A single turn of a car's scanner, its lines many pixels apart, from the rough calibration: nothing is claimed."""
+    rough = scenes.road(data_dir, tmp_path, rough=True)
+    (start,) = rough.views
+    result = register_sci(read_cloud(rough.cloud), read_photo(start.image).pixels, start)
+    assert not result.trusted and result.reasons
+    assert result.view is start

@@ -73,7 +73,7 @@ impl Measured {
     }
 
     fn has(&self, x: usize, y: usize) -> bool {
-        self.bits[y * self.words + x / 64] >> (x % 64) & 1 == 1
+        (self.bits[y * self.words + x / 64] >> (x % 64)) & 1 == 1
     }
 
     /// Calls `f` with the measured columns of row `y` from `first` to `last`, in this order.

@@ -37,7 +37,6 @@ from colourreg_rs.pictures import as_8_bit, draw_cloud
 from colourreg_rs.sci import render_sci, with_size
 
 Picture = npt.NDArray[np.uint8]
-DEPTH_CAMERA = ColouriseOptions(tolerance=0.01)
 
 
 def main() -> None:
@@ -92,9 +91,9 @@ def coloured_scenes(
 ) -> Iterator[tuple[str, Scene, ColouriseOptions | None, npt.NDArray[np.int64] | None]]:
     """Name, scene, options, and the points whose colours are compared where not all are."""
     for name, short in (("learn0", "kinect, table"), ("region_growing_rgb_tutorial", "kinect, office")):
-        yield short, scenes.kinect(data, name, folder), DEPTH_CAMERA, None
+        yield short, scenes.kinect(data, name, folder), None, None
     for a, b in ((0, 4), (4, 0), (2, 3)):
-        yield f"living room, {a} from {b}", scenes.living_room(data, folder, a, b), DEPTH_CAMERA, None
+        yield f"living room, {a} from {b}", scenes.living_room(data, folder, a, b), None, None
     scene = scenes.berlin(data, folder)
     yield "cathedral, three photos", scene, None, None
     for name, (rows, _) in scenes.berlin_observations(data).items():

@@ -31,7 +31,7 @@ app = typer.Typer(
 
 ToleranceOption = Annotated[
     float | None,
-    typer.Option(help="Noise of the cloud's depths, in parts of the depth: 0.003; for depth cameras 0.01."),
+    typer.Option(help="What is in front by less than this part of the depth hides nothing; from the depths' noise."),
 ]
 ReportOption = Annotated[Path | None, typer.Option(metavar="FILE", help="Write a report for people (HTML).")]
 JsonOption = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the result for machines.")]

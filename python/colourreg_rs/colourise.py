@@ -34,8 +34,8 @@ class ColouriseOptions:
 
     ``sigma_image`` (pixels, where a colour is taken) and ``sigma_xyz`` (the cloud's own noise, its unit) go into
     ColourSigma beside the view's covariance. Points whose ColourSigma exceeds ``max_sigma`` stay uncoloured.
-    ``tolerance`` is the noise of the cloud's depths in parts of the depth: what is in front by less hides nothing. The
-    default of 0.003 suits laser scans; clouds of depth cameras and of photogrammetry want about 0.01.
+    ``tolerance`` is a part of the depth: what is in front by less hides nothing. Without it the scatter of the cloud's
+    own depths decides, three sigma of it.
     ``photo_memory`` (bytes) is what photos that are not in use just now may take; see :mod:`colourreg_rs.photos`.
     """
 

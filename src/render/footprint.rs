@@ -17,6 +17,7 @@ use rayon::prelude::*;
 use super::extremes::{larger, smaller};
 use super::links::{LANES, Links, Surroundings, filled};
 use super::marks::{Canvas, MAX_REACH, Marks, Rule};
+use super::planes::{PLACE, depth_noise};
 use super::pyramid::Pyramid;
 use super::sample::Sample;
 use super::zbuffer::{DepthBuffer, Grid};
@@ -69,6 +70,8 @@ impl Footprint {
     }
 }
 
+/// Sigma of a place, pixels, of which nothing is known but the pixel.
+const ANYWHERE: f32 = 0.29;
 /// How far the first look at the nearest cells goes, cells.
 const NEARBY: f32 = 3.0;
 /// Rows that one task looks after; it may write into half as many above and below.
@@ -88,22 +91,30 @@ impl Surfaces {
     /// From a depth buffer that everything was put into.
     pub fn new(buffer: DepthBuffer, footprint: &Footprint) -> Result<Self> {
         let (view, grid) = (*buffer.view(), buffer.grid());
-        Self::from_samples(&view, grid, buffer.into_samples(), footprint)
+        Self::from_samples(&view, grid, buffer.into_samples(), PLACE, footprint)
     }
 
     /// From the inverse depths in the cells of a grid, of points at the pixels' centres.
     pub fn from_inverse_depth(view: &View, grid: Grid, inverse_depth: Vec<f32>, footprint: &Footprint) -> Result<Self> {
         let centred = |&v: &f32| if v > 0.0 { Sample::new(v, [0.5, 0.5]) } else { Sample::default() };
-        Self::from_samples(view, grid, inverse_depth.par_iter().map(centred).collect(), footprint)
+        Self::from_samples(view, grid, inverse_depth.par_iter().map(centred).collect(), ANYWHERE, footprint)
     }
 
-    fn from_samples(view: &View, grid: Grid, mut samples: Vec<Sample>, footprint: &Footprint) -> Result<Self> {
+    fn from_samples(
+        view: &View,
+        grid: Grid,
+        mut samples: Vec<Sample>,
+        place: f32,
+        footprint: &Footprint,
+    ) -> Result<Self> {
         grid.wrap(&mut samples);
         let pixel_angle = pixel_angle(view);
         let ratios = [footprint.gap_ratio, footprint.row_ratio];
         let surroundings = Surroundings::new(grid, &samples, footprint.steepest, pixel_angle, ratios);
         let Footprint { tolerance, inner, .. } = *footprint;
-        let rule = Rule { tolerance, inner, pixel_angle, noise: surroundings.noise };
+        // Neighbours alone do not tell the noise of depths that come in steps, as a depth camera's do.
+        let noise = surroundings.noise.max(depth_noise(view, grid, &samples, place));
+        let rule = Rule { tolerance, inner, pixel_angle, noise };
         let mut limit = zeros(grid.len(), "the surfaces of a depth buffer")?;
         let first = in_bands(&grid, &mut limit, |_, rows, canvas| FirstLook::over(&surroundings, &rule, rows, canvas));
         let mut spacing = vec![0; grid.first_row() * grid.stride()];

@@ -32,7 +32,7 @@ const OFF: [(f32, f32); 2] = [(0.0005, 3.0), (0.002, 6.0)];
 /// The inverse depth's rounding, relative.
 const ROUNDING: f32 = 1e-5;
 /// The place's rounding, pixels.
-const PLACE: f32 = 0.03;
+pub(super) const PLACE: f32 = 0.03;
 /// Pixels of the blocks in which the density of samples is found, and of how many one is looked at.
 const BLOCK: (usize, usize) = (64, 3);
 /// Of so many cells, across and down, one says how noisy depths are.
@@ -65,27 +65,8 @@ struct Face {
 impl LocalPlanes {
     /// From the samples in the cells of a grid.
     pub fn new(view: &View, grid: Grid, samples: &[Sample]) -> Self {
-        let fill = density(&grid, samples);
-        let pixels = (SAMPLES_ACROSS / fill.sqrt()).clamp(CELL[0], CELL[1]);
-        let step = pixels * f64::from(super::pixel_angle(view));
-        let face = |axes, sign, low: [f64; 2], high: [f64; 2]| {
-            let size = [0, 1].map(|k| ((high[k] - low[k]) / step).ceil().clamp(1.0, 4096.0) as usize);
-            Face { axes, sign, low, size, step, cells: Vec::new() }
-        };
-        let mut faces = match view.camera.depth_kind() {
-            Depth::AlongAxis => {
-                let (low, high) = forward_field(view);
-                vec![face([0, 1, 2], 1.0, low, high)]
-            }
-            Depth::Range => (0..6)
-                .map(|f| {
-                    let k = f / 2;
-                    face([(k + 1) % 3, (k + 2) % 3, k], if f % 2 == 0 { 1.0 } else { -1.0 }, [-1.0; 2], [1.0; 2])
-                })
-                .collect(),
-        };
-        let looks = Looks { camera: view.camera, grid, samples, pixels, fill };
-        let noise = looks.depth_noise(&faces);
+        let (looks, mut faces) = prepared(view, grid, samples);
+        let noise = looks.depth_noise(&faces, PLACE);
         for face in &mut faces {
             let [columns, rows] = face.size;
             let mut cells = vec![[[0.0; 3]; LAYERS]; columns * rows];
@@ -144,6 +125,36 @@ impl LocalPlanes {
     pub fn depth_noise(&self) -> f32 {
         self.noise
     }
+}
+
+/// Sigma of a depth, in the cloud's unit, as samples scatter about local planes, whose places are good to `place` pixels.
+pub(super) fn depth_noise(view: &View, grid: Grid, samples: &[Sample], place: f32) -> f32 {
+    let (looks, faces) = prepared(view, grid, samples);
+    looks.depth_noise(&faces, place)
+}
+
+/// What planes are fitted to, and the empty faces for them.
+fn prepared<'a>(view: &View, grid: Grid, samples: &'a [Sample]) -> (Looks<'a>, Vec<Face>) {
+    let fill = density(&grid, samples);
+    let pixels = (SAMPLES_ACROSS / fill.sqrt()).clamp(CELL[0], CELL[1]);
+    let step = pixels * f64::from(super::pixel_angle(view));
+    let face = |axes, sign, low: [f64; 2], high: [f64; 2]| {
+        let size = [0, 1].map(|k| ((high[k] - low[k]) / step).ceil().clamp(1.0, 4096.0) as usize);
+        Face { axes, sign, low, size, step, cells: Vec::new() }
+    };
+    let faces = match view.camera.depth_kind() {
+        Depth::AlongAxis => {
+            let (low, high) = forward_field(view);
+            vec![face([0, 1, 2], 1.0, low, high)]
+        }
+        Depth::Range => (0..6)
+            .map(|f| {
+                let k = f / 2;
+                face([(k + 1) % 3, (k + 2) % 3, k], if f % 2 == 0 { 1.0 } else { -1.0 }, [-1.0; 2], [1.0; 2])
+            })
+            .collect(),
+    };
+    (Looks { camera: view.camera, grid, samples, pixels, fill }, faces)
 }
 
 /// The share of cells that hold a sample, where there are any: the median of blocks of the photo.
@@ -259,21 +270,24 @@ impl Looks<'_> {
     }
 
     /// The median, over windows, of what the least-squares plane leaves over: edges and leaves do not count.
-    fn depth_noise(&self, faces: &[Face]) -> f32 {
-        let mut spots = Vec::new();
-        let mut found = Vec::new();
-        for face in faces {
-            for row in (EVERY / 2..face.size[1]).step_by(EVERY) {
-                for column in (EVERY / 2..face.size[0]).step_by(EVERY) {
-                    let Some(window) = self.window(face, [column, row]) else { continue };
-                    self.gather(&window, RADIUS * self.pixels, &mut spots);
-                    let Some(plane) = Plane::fitted(spots.iter()).filter(|_| spots.len() >= FEWEST) else { continue };
-                    let rounded = ROUNDING * plane.c + PLACE / (RADIUS * self.pixels) as f32 * plane.ga.hypot(plane.gb);
-                    let rest = plane.rms * plane.rms - rounded * rounded;
-                    found.push(rest.max(0.0).sqrt() / (plane.c * plane.c));
-                }
+    fn depth_noise(&self, faces: &[Face], place: f32) -> f32 {
+        let rows = |face: &Face| (EVERY / 2..face.size[1]).step_by(EVERY).collect::<Vec<_>>();
+        let rows: Vec<(&Face, usize)> =
+            faces.iter().flat_map(|f| rows(f).into_iter().map(move |row| (f, row))).collect();
+        let of_row = |spots: &mut Vec<Spot>, (face, row): (&Face, usize)| {
+            let mut found = Vec::new();
+            for column in (EVERY / 2..face.size[0]).step_by(EVERY) {
+                let Some(window) = self.window(face, [column, row]) else { continue };
+                self.gather(&window, RADIUS * self.pixels, spots);
+                let Some(plane) = Plane::fitted(spots.iter()).filter(|_| spots.len() >= FEWEST) else { continue };
+                let rounded = ROUNDING * plane.c + place / (RADIUS * self.pixels) as f32 * plane.ga.hypot(plane.gb);
+                let rest = plane.rms * plane.rms - rounded * rounded;
+                found.push(rest.max(0.0).sqrt() / (plane.c * plane.c));
             }
-        }
+            found
+        };
+        let found: Vec<Vec<f32>> = rows.into_par_iter().map_init(Vec::new, of_row).collect();
+        let mut found = found.concat();
         found.retain(|noise| noise.is_finite());
         found.sort_by(f32::total_cmp);
         found.get(found.len() / 2).copied().unwrap_or(0.0)

@@ -112,9 +112,8 @@ impl Surfaces {
         let ratios = [footprint.gap_ratio, footprint.row_ratio];
         let surroundings = Surroundings::new(grid, &samples, footprint.steepest, pixel_angle, ratios);
         let Footprint { tolerance, inner, .. } = *footprint;
-        // Neighbours alone do not tell the noise of depths that come in steps, as a depth camera's do.
-        let noise = surroundings.noise.max(depth_noise(view, grid, &samples, place));
-        let rule = Rule { tolerance, inner, pixel_angle, noise };
+        let wide_noise = depth_noise(view, grid, &samples, place);
+        let rule = Rule { tolerance, inner, pixel_angle, noise: surroundings.noise, wide_noise };
         let mut limit = zeros(grid.len(), "the surfaces of a depth buffer")?;
         let first = in_bands(&grid, &mut limit, |_, rows, canvas| FirstLook::over(&surroundings, &rule, rows, canvas));
         let mut spacing = vec![0; grid.first_row() * grid.stride()];

@@ -13,6 +13,9 @@ const OUTER: (f32, f32) = (0.9, 0.15);
 /// The least that a sample covers, cells.
 const LEAST: f32 = 0.1;
 
+/// What is believed of the noise in wide windows, as a part of the depth: a third of a percent is a bad depth camera's.
+const MOST_WIDE_NOISE: f32 = 1.0 / 300.0;
+
 /// How a surface becomes a mark.
 pub(super) struct Rule {
     /// What is in front by less than this part of the depth hides nothing; `None` for what the noise suggests.
@@ -21,8 +24,11 @@ pub(super) struct Rule {
     pub inner: f32,
     /// Radians that a cell spans.
     pub pixel_angle: f32,
-    /// Sigma of a depth, in the cloud's unit.
+    /// Sigma of a depth, in the cloud's unit, against the nearest neighbours.
     pub noise: f32,
+    /// The same against planes through wide windows, which tells the noise of depths that come in steps, as a depth
+    /// camera's do; and takes the relief of a sparse scan for noise.
+    pub wide_noise: f32,
 }
 
 /// What a sample covers, and how near that is.
@@ -50,9 +56,10 @@ impl Rule {
     pub fn mark(&self, patch: &Patch) -> Mark {
         let [gx, gy] = patch.gradient();
         let own = patch.own + patch.lift([gx, gy]);
+        let noise = larger(self.noise, smaller(self.wide_noise, MOST_WIDE_NOISE / own));
         // Noise moves a point not only along the ray: across it, on a slope, it does as much.
-        let across = 0.5 + smaller(1.5 * self.noise * own / self.pixel_angle, 2.0);
-        let floor = self.tolerance.unwrap_or(1e-4 + 3.0 * self.noise * own) + 0.3 * self.pixel_angle;
+        let across = 0.5 + smaller(1.5 * noise * own / self.pixel_angle, 2.0);
+        let floor = self.tolerance.unwrap_or(1e-4 + 3.0 * noise * own) + 0.3 * self.pixel_angle;
         let slack = own * floor + 0.25 * patch.misfit() + across * (gx.abs() + gy.abs());
         let spacing = patch.spacing();
         let spacing = if spacing < f32::INFINITY { spacing } else { 0.0 };

@@ -112,9 +112,10 @@ class DepthBuffer:
         max_incidence: float | None = None,
     ) -> None:
         """``tolerance``: what is in front by less than this part of the depth (and what follows from slope and pixel
-        size) hides nothing; 0.003 if not given. ``max_gap``: the widest gap between points of one surface, pixels, that
-        is taken as covered; 64. ``max_distance`` (the cloud's unit) and ``max_incidence`` (radians from the surface's
-        normal, in (0, π/2]) refuse points. Memory: 4 bytes per pixel until finished. Raises InvalidInputError."""
+        size) hides nothing; three sigma of the depths' own scatter if not given. ``max_gap``: the widest gap between
+        points of one surface, pixels, that is taken as covered; 32. ``max_distance`` (the cloud's unit) and
+        ``max_incidence`` (radians from the surface's normal, in (0, π/2]) refuse points.
+        Memory: 4 bytes per pixel until finished. Raises InvalidInputError."""
 
     def add(self, xyz: FloatArray) -> None:
         """Puts a chunk (N, 3) in; NaN points are left out. Releases the GIL; several threads may call it at once.

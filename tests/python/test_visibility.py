@@ -125,3 +125,16 @@ def test_limits_of_distance_and_incidence(rng):
     for options in ({"max_distance": -1.0}, {"max_incidence": 2.0}, {"tolerance": -0.1}, {"max_gap": np.nan}):
         with pytest.raises(InvalidInputError):
             _core.DepthBuffer(view, **options)
+
+
+@pytest.mark.parametrize("block", [3, 5])
+def test_noise_that_neighbours_share_does_not_hide_the_surface_itself(rng, block):
+    """A depth camera's wall: patches of equal depth, which then jumps by more than neighbours tell of the noise."""
+    width, height = 320, 240
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(float(width)), np.arange(float(height))))
+    noise = np.kron(rng.normal(0, 0.012, (height // block + 1, width // block + 1)), np.ones((block, block)))
+    depth = 2.0 + noise[:height, :width].ravel()
+    xyz = np.column_stack([(x - 159.5) / 260 * depth + 0.05, (y - 119.5) / 260 * depth, depth])
+    buffer = _core.DepthBuffer(pinhole(260.0, (width, height)))
+    buffer.add(xyz)
+    assert buffer.finish().visible(xyz).mean() > 0.955

@@ -16,6 +16,7 @@ from .errors import (
 from .model import Camera, ControlPoint, Covariance, PointCloud, Pose, Registration, View
 
 if TYPE_CHECKING:
+    from .backproject import BackprojectOptions, backproject_file
     from .colourise import ColouriseOptions, Colouriser, colourise_file
     from .evaluate import evaluate_view
     from .io.clouds import read_cloud, write_cloud
@@ -23,12 +24,16 @@ if TYPE_CHECKING:
     from .io.points import read_points
     from .io.registration import read_camera, read_registration, write_registration
     from .register import RegisterOptions, register_photo
+    from .sci import SCI, render_sci
 
 #: The workflow and the files, imported when first used: `import colourreg_rs` stays as quick as numpy's.
 _LATER = {
+    "SCI": "sci",
+    "BackprojectOptions": "backproject",
     "ColouriseOptions": "colourise",
     "Colouriser": "colourise",
     "RegisterOptions": "register",
+    "backproject_file": "backproject",
     "colourise_file": "colourise",
     "evaluate_view": "evaluate",
     "read_camera": "io.registration",
@@ -37,11 +42,14 @@ _LATER = {
     "read_points": "io.points",
     "read_registration": "io.registration",
     "register_photo": "register",
+    "render_sci": "sci",
     "write_cloud": "io.clouds",
     "write_registration": "io.registration",
 }
 
 __all__ = [
+    "SCI",
+    "BackprojectOptions",
     "Camera",
     "ColouriseOptions",
     "Colouriser",
@@ -59,6 +67,7 @@ __all__ = [
     "Registration",
     "View",
     "__version__",
+    "backproject_file",
     "colourise_file",
     "evaluate_view",
     "read_camera",
@@ -67,6 +76,7 @@ __all__ = [
     "read_points",
     "read_registration",
     "register_photo",
+    "render_sci",
     "write_cloud",
     "write_registration",
 ]

@@ -93,14 +93,14 @@ def cases(
     """The photos of a scene (the first ``photos``, or all) with the truth; kept in ``cache`` where that is given."""
     file = None if cache is None else cache / f"visibility-{scene}-{seed}-{size[0]}x{size[1]}-{photos or 'all'}.pickle"
     if file is not None and file.exists():
-        kept: list[Case] = pickle.loads(file.read_bytes())
-        return kept
+        return [Case(**fields) for fields in pickle.loads(file.read_bytes())]
     response = Response().without_noise()
     made = simulate(scene, seed=seed, photos=photos, size=size, samples=4, draft=True, response=response)
     found = [case(made, i) for i in range(len(made.photos))]
     if file is not None:
         file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_bytes(pickle.dumps(found))
+        # Plain values: a class is kept by the name of its module, which is another one when that is run as a command.
+        file.write_bytes(pickle.dumps([vars(c) for c in found]))
     return found
 
 

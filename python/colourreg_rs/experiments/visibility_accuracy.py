@@ -2,12 +2,12 @@
 
 Simulated scenes, each with its own seed, are scanned and photographed; the scan is coloured with the true view from a
 photo without noise. Every point is asked, by casting rays into the exact scene, whether the photo sees it and, where
-it does not, whether what hides it was scanned: nothing else can be known to hide it. Printed for each photo, in percent:
+it does not, whether what hides it was scanned: nothing else can be known to hide it. For each photo, in percent:
 
 - *seen*: of the points that the photo sees, those that got a colour;
 - *hidden*: of the points hidden behind scanned surfaces, those that got a colour;
-- *beyond 1 px*: the same, counted only where the picture shows nothing as far away as the point within a pixel of it, so
-  that neither noise of the position nor the pixel itself excuses the colour;
+- *beyond 1 px*: of the same points, those that got a colour though the picture shows nothing as far away as the point
+  within a pixel of it;
 - *colour*: the median difference from the true colour, grey levels of 255, over the seen points that have one.
 
     python -m colourreg_rs.experiments.visibility_accuracy --scene square --seeds 6 --megapixels 1.5 --megapixels 6
@@ -64,7 +64,7 @@ class Case:
     @property
     def megapixels(self) -> float:
         """Of the photo."""
-        return self.image.shape[0] * self.image.shape[1] / 1e6
+        return float(self.image.shape[0] * self.image.shape[1]) / 1e6
 
 
 @dataclass(frozen=True)
@@ -198,8 +198,8 @@ HEADER = (
 def line(o: Outcome) -> str:
     """A row of the table."""
     return (
-        f"| {o.scene:7} | {o.megapixels:4.1f} | {o.seed:4} | {o.photo:5} | {100 * o.seen:7.2f} | {100 * o.hidden:9.2f} | "
-        f"{100 * o.far:14.2f} | {o.colour:6.2f} |"
+        f"| {o.scene:7} | {o.megapixels:4.1f} | {o.seed:4} | {o.photo:5} | {100 * o.seen:7.2f} | "
+        f"{100 * o.hidden:9.2f} | {100 * o.far:14.2f} | {o.colour:6.2f} |"
     )
 
 

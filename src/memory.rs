@@ -4,6 +4,8 @@
 use std::sync::atomic::{AtomicU32, AtomicU64};
 
 use crate::error::{Error, Result};
+use crate::neighbours::Neighbour;
+use crate::render::Sample;
 
 /// A value whose bits may all be zero.
 ///
@@ -16,6 +18,28 @@ unsafe impl Zeroed for AtomicU32 {}
 unsafe impl Zeroed for AtomicU64 {}
 // SAFETY: all bits zero is the number 0.
 unsafe impl Zeroed for f32 {}
+// SAFETY: all bits zero is the number 0.
+unsafe impl Zeroed for f64 {}
+// SAFETY: all bits zero is the number 0.
+unsafe impl Zeroed for i64 {}
+// SAFETY: all bits zero is the number 0.
+unsafe impl Zeroed for u32 {}
+// SAFETY: all bits zero is the first point, at no distance.
+unsafe impl Zeroed for Neighbour {}
+// SAFETY: all bits zero is an empty cell.
+unsafe impl Zeroed for Sample {}
+// SAFETY: an array is its elements side by side.
+unsafe impl<T: Zeroed, const N: usize> Zeroed for [T; N] {}
+
+/// `n` zeros that are about to be written over. As `vec![0; n]`, which the memory's end ends likewise, but in large pages:
+/// what fresh memory costs is the finding of its pages, one by one.
+pub(crate) fn fresh<T: Zeroed + Clone>(n: usize) -> Vec<T> {
+    let Ok(layout) = std::alloc::Layout::array::<T>(n) else { std::process::abort() };
+    if layout.size() == 0 {
+        return Vec::new();
+    }
+    zeros(n, "").unwrap_or_else(|_| std::alloc::handle_alloc_error(layout))
+}
 
 /// `n` zeros for `what`; refused where there is no memory.
 pub(crate) fn zeros<T: Zeroed>(n: usize, what: &str) -> Result<Vec<T>> {

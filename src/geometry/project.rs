@@ -8,14 +8,15 @@ use super::camera::MAX_PARAMS;
 use super::pose::skew_matrix;
 use super::view::View;
 use crate::error::{Error, Result};
+use crate::memory::fresh;
 
 /// Points per task of the scheduler.
 const TASK: usize = 32 * LANES;
 
 /// World points to pixels and depths. What the camera cannot see is NaN in both.
 pub fn project(view: &View, xyz: &[[f64; 3]]) -> (Vec<[f64; 2]>, Vec<f64>) {
-    let mut xy = vec![[0.0; 2]; xyz.len()];
-    let mut depth = vec![0.0; xyz.len()];
+    let mut xy = fresh(xyz.len());
+    let mut depth = fresh(xyz.len());
     fill(view, xyz, &mut xy, &mut depth);
     (xy, depth)
 }

@@ -1,9 +1,10 @@
 //! The nearest of many points, in the plane and in space.
 //!
 //! Two structures share the work. A *grid* of square cells with about two points each is the fastest that there is for
-//! points of the plane that lie evenly; queries whose neighbours lie more than a few cells away, clustered points and
-//! points of space go to a balanced *kd-tree*. Both are exact, so that the choice shows in time alone. Batches are
-//! worked off in an order that keeps neighbours in the cache, in parallel; the results do not depend on it.
+//! points of the plane that lie evenly; queries whose neighbours lie more than a few cells away are given to one of larger
+//! cells. What is farther still, clustered points and points of space go to a balanced *kd-tree*. Both are exact, so that
+//! the choice shows in time alone. Batches are worked off in an order that keeps neighbours in the cache, in parallel;
+//! the results do not depend on it.
 //!
 //! Between points at the same distance the grid takes the lower index; the tree takes one of them, always the same.
 
@@ -16,6 +17,7 @@ use std::sync::OnceLock;
 use rayon::prelude::*;
 
 use crate::error::{Error, Result};
+use crate::memory::fresh;
 use grid::Grid;
 pub(crate) use order::along_a_curve;
 use tree::Tree;
@@ -48,7 +50,7 @@ impl Neighbour {
     /// Nearer, or as near with the lower index.
     #[inline(always)]
     fn before(&self, other: &Self) -> bool {
-        self.distance2 < other.distance2 || (self.distance2 == other.distance2 && self.index < other.index)
+        (self.distance2 < other.distance2) | ((self.distance2 == other.distance2) & (self.index < other.index))
     }
 }
 
@@ -65,6 +67,8 @@ pub struct Within {
 pub struct Neighbours<const D: usize> {
     points: Vec<[f64; D]>,
     grid: Option<Grid>,
+    /// The same with larger cells, for queries that the grid gives up.
+    coarse: OnceLock<Grid>,
     tree: OnceLock<Tree<D>>,
 }
 
@@ -80,7 +84,7 @@ impl<const D: usize> Neighbours<D> {
         refuse_not_finite(points, "point")?;
         let points = points.to_vec();
         let grid = if D == 2 { Grid::new(points.as_flattened().as_chunks::<2>().0) } else { None };
-        let this = Self { points, grid, tree: OnceLock::new() };
+        let this = Self { points, grid, coarse: OnceLock::new(), tree: OnceLock::new() };
         if this.grid.is_none() {
             this.tree();
         }
@@ -104,7 +108,17 @@ impl<const D: usize> Neighbours<D> {
 
     /// Built when the first query needs it: a grid answers most queries of the plane alone.
     fn tree(&self) -> &Tree<D> {
-        self.tree.get_or_init(|| Tree::new(&self.points))
+        self.tree.get_or_init(|| apart(|| Tree::new(&self.points)))
+    }
+
+    /// Asks the grid, and the coarser one where that cannot tell.
+    #[inline]
+    fn ask_grids<T>(&self, mut ask: impl FnMut(&Grid) -> Option<T>) -> Option<T> {
+        let grid = self.grid.as_ref()?;
+        ask(grid).or_else(|| {
+            let points = || self.points.as_flattened().as_chunks::<2>().0;
+            ask(self.coarse.get_or_init(|| apart(|| grid.coarser(points()))))
+        })
     }
 
     /// The nearest point of one query within a distance; the query has to be finite.
@@ -113,13 +127,26 @@ impl<const D: usize> Neighbours<D> {
         self.nearest_from(query, Neighbour { index: NONE, distance2: max_distance * max_distance })
     }
 
-    /// The nearest point of one query where one is known to be no farther than `known`, which has that point's index or
-    /// [`NONE`]: the closer it is, the shorter the search.
     #[inline]
-    pub(crate) fn nearest_from(&self, query: &[f64; D], known: Neighbour) -> Neighbour {
-        match self.grid.as_ref().and_then(|g| g.nearest(&[query[0], query[1]], known)) {
+    fn nearest_from(&self, query: &[f64; D], known: Neighbour) -> Neighbour {
+        match self.ask_grids(|g| g.nearest(&[query[0], query[1]], known)) {
             Some(neighbour) => neighbour,
             None => self.tree().nearest(query, known.distance2),
+        }
+    }
+
+    /// The nearest point of one query where one is known to be no farther than `known`, which has that point's index or
+    /// [`NONE`]: the closer it is, the shorter the search. And a squared distance below which there is no other point,
+    /// which may be too small: as long as the query moves less than it allows, no search is needed.
+    #[inline]
+    pub(crate) fn nearest_and_rest(&self, query: &[f64; D], known: Neighbour) -> (Neighbour, f64) {
+        match self.ask_grids(|g| g.nearest_and_rest(&[query[0], query[1]], known)) {
+            Some(found) => found,
+            None => {
+                let nearest = self.tree().nearest(query, f64::INFINITY);
+                let within = if nearest.distance2 <= known.distance2 { nearest } else { Neighbour::NONE };
+                (within, nearest.distance2)
+            }
         }
     }
 
@@ -127,8 +154,8 @@ impl<const D: usize> Neighbours<D> {
     /// [`Neighbour::NONE`].
     pub fn k_nearest_one(&self, query: &[f64; D], max_distance: f64, out: &mut [Neighbour]) {
         let limit2 = max_distance * max_distance;
-        let answered = self.grid.as_ref().is_some_and(|g| g.k_nearest(&[query[0], query[1]], limit2, out));
-        if !answered {
+        let answered = self.ask_grids(|g| g.k_nearest(&[query[0], query[1]], limit2, out));
+        if answered.is_none() {
             self.tree().k_nearest(query, limit2, out);
         }
     }
@@ -150,7 +177,7 @@ impl<const D: usize> Neighbours<D> {
         let Some(order) = self.order(queries) else {
             return Ok(self.nearest_in_order(queries, max_distance));
         };
-        let mut sorted = vec![Neighbour::NONE; queries.len()];
+        let mut sorted: Vec<Neighbour> = fresh(queries.len());
         sorted.par_chunks_mut(BLOCK).zip(order.par_chunks(BLOCK)).for_each(|(out, order)| {
             for (out, &i) in out.iter_mut().zip(order) {
                 *out = self.nearest_one(&queries[i as usize], max_distance);
@@ -176,7 +203,7 @@ impl<const D: usize> Neighbours<D> {
                 self.k_nearest_one(&queries[i], max_distance, row);
             }
         };
-        let mut rows = vec![Neighbour::NONE; queries.len() * k];
+        let mut rows: Vec<Neighbour> = fresh(queries.len() * k);
         match self.order(queries) {
             None => {
                 rows.par_chunks_mut(64 * k).enumerate().for_each(|(b, rows)| fill(rows, &mut (64 * b..queries.len())));
@@ -237,6 +264,20 @@ impl<const D: usize> Neighbours<D> {
             None => order::along_a_curve(queries),
         })
     }
+}
+
+/// Builds what several queries may be waiting for, in threads of its own: a thread of the pool that waited for a part of
+/// it would take up another query meanwhile, and wait for itself.
+fn apart<T: Send>(build: impl FnOnce() -> T + Send) -> T {
+    if rayon::current_thread_index().is_none() {
+        return build();
+    }
+    let threads = rayon::current_num_threads();
+    let run = || match rayon::ThreadPoolBuilder::new().num_threads(threads).build() {
+        Ok(pool) => pool.install(build),
+        Err(_) => build(),
+    };
+    std::thread::scope(|scope| scope.spawn(run).join()).unwrap_or_else(|panic| std::panic::resume_unwind(panic))
 }
 
 /// Names the first row that holds a value that is not finite.

@@ -6,6 +6,7 @@ use rayon::prelude::*;
 
 use super::arrays::{Input, owned, points2, points3};
 use crate::error::Result;
+use crate::memory::fresh;
 use crate::neighbours::{NONE, Neighbour, Neighbours, Within};
 
 enum Index {
@@ -18,8 +19,13 @@ pub(super) struct PyNeighbours(Index);
 
 /// Indices with −1 where there is no neighbour, and distances.
 fn columns(found: &[Neighbour]) -> (Vec<i64>, Vec<f64>) {
-    let one = |n: &Neighbour| (if n.index == NONE { -1 } else { i64::from(n.index) }, n.distance2.sqrt());
-    found.par_iter().with_min_len(8192).map(one).unzip()
+    let (mut index, mut distance) = (fresh(found.len()), fresh(found.len()));
+    let one = |((i, d), n): ((&mut i64, &mut f64), &Neighbour)| {
+        *i = if n.index == NONE { -1 } else { i64::from(n.index) };
+        *d = n.distance2.sqrt();
+    };
+    index.par_iter_mut().zip(distance.par_iter_mut()).zip(found).with_min_len(8192).for_each(one);
+    (index, distance)
 }
 
 /// Runs one of the core's batch searches, whatever the dimension.

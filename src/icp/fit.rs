@@ -105,8 +105,13 @@ pub(super) fn derivatives(u: &[f64; 2]) -> [[f64; MOST]; 2] {
 /// A point under a projective transformation.
 #[inline(always)]
 pub(super) fn apply(h: &Matrix3<f64>, p: &[f64; 2]) -> [f64; 2] {
+    let (x, y) = (h[(0, 0)] * p[0] + h[(0, 1)] * p[1] + h[(0, 2)], h[(1, 0)] * p[0] + h[(1, 1)] * p[1] + h[(1, 2)]);
+    // Most are affine, and divisions are what this costs.
+    if h[(2, 0)] == 0.0 && h[(2, 1)] == 0.0 && h[(2, 2)] == 1.0 {
+        return [x, y];
+    }
     let w = h[(2, 0)] * p[0] + h[(2, 1)] * p[1] + h[(2, 2)];
-    [(h[(0, 0)] * p[0] + h[(0, 1)] * p[1] + h[(0, 2)]) / w, (h[(1, 0)] * p[0] + h[(1, 1)] * p[1] + h[(1, 2)]) / w]
+    [x / w, y / w]
 }
 
 /// Centroid and root mean square spread of points: the units of the adjustment.
@@ -137,7 +142,8 @@ impl Units {
 
     #[inline(always)]
     pub fn local(&self, p: &[f64; 2]) -> [f64; 2] {
-        [(p[0] - self.centre[0]) / self.spread, (p[1] - self.centre[1]) / self.spread]
+        let scale = 1.0 / self.spread;
+        [(p[0] - self.centre[0]) * scale, (p[1] - self.centre[1]) * scale]
     }
 
     /// A transformation of local coordinates as one of the points' own.
@@ -188,6 +194,20 @@ impl<const P: usize> Normal<P> {
         self
     }
 
+    /// As [`Normal::add`] with the weight of one.
+    #[inline(always)]
+    fn add_plain(mut self, u: &[f64; 2], v: &[f64; 2]) -> Self {
+        let [jx, jy] = derivatives(u);
+        let (dx, dy) = (v[0] - u[0], v[1] - u[1]);
+        for i in 0..P {
+            self.g[i] += jx[i] * dx + jy[i] * dy;
+            for k in i..P {
+                self.n[i][k] += jx[i] * jx[k] + jy[i] * jy[k];
+            }
+        }
+        self
+    }
+
     fn join(mut self, other: Self) -> Self {
         for i in 0..P {
             self.g[i] += other.g[i];
@@ -206,11 +226,21 @@ impl<const P: usize> Normal<P> {
 
 /// `N` and `g` of the pairs after a first motion of their local coordinates.
 fn normal_equations<const P: usize>(pairs: &Pairs, units: &Units, h: &Matrix3<f64>) -> (DMatrix<f64>, DVector<f64>) {
-    let add = |sum: Normal<P>, k: usize| {
-        sum.add(&apply(h, &units.local(&pairs.moved[k])), &units.local(&pairs.goals[k]), &pairs.weight(k))
-    };
+    let weights = pairs.weights();
+    let pair = |k: usize| (apply(h, &units.local(&pairs.moved[k])), units.local(&pairs.goals[k]));
     let starts: Vec<usize> = (0..pairs.len()).step_by(CHUNK).collect();
-    let part = |&from: &usize| (from..(from + CHUNK).min(pairs.len())).fold(Normal::ZERO, add);
+    let part = |&from: &usize| {
+        let chunk = from..(from + CHUNK).min(pairs.len());
+        let plain = |sum: Normal<P>, k: usize| {
+            let (u, v) = pair(k);
+            sum.add_plain(&u, &v)
+        };
+        let weighed = |sum: Normal<P>, k: usize| {
+            let (u, v) = pair(k);
+            sum.add(&u, &v, &weights[k])
+        };
+        if weights.is_empty() { chunk.fold(Normal::ZERO, plain) } else { chunk.fold(Normal::ZERO, weighed) }
+    };
     let parts: Vec<Normal<P>> = starts.par_iter().map(part).collect();
     parts.into_iter().fold(Normal::ZERO, Normal::join).dynamic()
 }

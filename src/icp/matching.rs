@@ -1,5 +1,7 @@
 //! Pairs of closest points, and which of them count.
 
+use std::cell::{OnceCell, RefCell};
+
 use nalgebra::Matrix3;
 use rayon::prelude::*;
 use statrs::distribution::{ChiSquared, ContinuousCDF};
@@ -77,7 +79,46 @@ pub(super) struct Pairs {
     /// Of the whole source, in the order of work.
     all: Vec<[f64; 2]>,
     found: Vec<Neighbour>,
-    lengths2: Vec<f64>,
+    held: Vec<Held>,
+}
+
+/// What the last search for a source point's partner found, and how far the point may move until it has to be repeated.
+#[derive(Clone, Copy)]
+struct Held {
+    /// Where the point was.
+    place: [f64; 2],
+    /// Its nearest target point, whether or not it was within the threshold, or [`NONE`] where it is not known.
+    index: u32,
+    /// No other target point was nearer to it.
+    rest: f64,
+}
+
+impl Held {
+    const NOTHING: Self = Self { place: [0.0; 2], index: NONE, rest: 0.0 };
+
+    /// The partner within `limit2` of the point at its present place.
+    #[inline(always)]
+    fn partner(&mut self, p: &[f64; 2], targets: &[[f64; 2]], index: &Neighbours<2>, limit2: f64) -> Neighbour {
+        let moved = ((p[0] - self.place[0]).powi(2) + (p[1] - self.place[1]).powi(2)).sqrt();
+        // What rounding does to lengths is far less than this.
+        let rest = self.rest * (1.0 - 1e-9) - moved;
+        let mut known = Neighbour { index: NONE, distance2: limit2 };
+        if let Some(y) = targets.get(self.index as usize) {
+            let distance2 = (p[0] - y[0]).powi(2) + (p[1] - y[1]).powi(2);
+            let near = distance2 <= limit2;
+            if rest > 0.0 && distance2 < rest * rest {
+                return if near { Neighbour { index: self.index, distance2 } } else { Neighbour::NONE };
+            }
+            if near {
+                known = Neighbour { index: self.index, distance2 };
+            }
+        } else if rest > 0.0 && limit2 < rest * rest {
+            return Neighbour::NONE;
+        }
+        let (found, rest2) = index.nearest_and_rest(p, known);
+        *self = Self { place: *p, index: found.index, rest: rest2.sqrt() };
+        found
+    }
 }
 
 impl Pairs {
@@ -85,57 +126,74 @@ impl Pairs {
         self.source.len()
     }
 
+    /// xx, xy, yy of each pair; empty where all weigh the same.
+    pub fn weights(&self) -> &[[f64; 3]] {
+        &self.weights
+    }
+
     /// The weight of a pair.
     #[inline(always)]
     pub fn weight(&self, k: usize) -> [f64; 3] {
         self.weights.get(k).copied().unwrap_or([1.0, 0.0, 1.0])
     }
+}
 
-    /// What is left under a transformation; its vectors go into `vectors`.
-    pub fn residuals_under(
-        &mut self,
-        transform: &Matrix3<f64>,
-        matcher: &Matcher,
-        vectors: &mut Vec<[f64; 2]>,
-    ) -> Residuals {
+/// What the pairs leave. Kept from iteration to iteration, as they are.
+#[derive(Default)]
+pub(super) struct Residuals {
+    /// Target minus transformed source.
+    pub vectors: Vec<[f64; 2]>,
+    /// The sum of their squared lengths.
+    pub squares: f64,
+    /// Per coordinate; across the lines where these are what is minimised.
+    pub rms: f64,
+    /// The largest length.
+    pub largest: f64,
+    lengths2: RefCell<Vec<f64>>,
+    robust_sigma: OnceCell<f64>,
+}
+
+impl Residuals {
+    /// Those of pairs under a transformation.
+    pub fn take(&mut self, pairs: &Pairs, transform: &Matrix3<f64>, matcher: &Matcher) {
         let source = &matcher.source.points;
         let vector = |(&i, y): (&u32, &[f64; 2])| {
             let p = apply(transform, &source[i as usize]);
             [y[0] - p[0], y[1] - p[1]]
         };
-        self.source.par_iter().zip(&self.goals).with_min_len(4096).map(vector).collect_into_vec(vectors);
+        let vectors = &mut self.vectors;
+        pairs.source.par_iter().zip(&pairs.goals).with_min_len(4096).map(vector).collect_into_vec(vectors);
         let square = |v: &[f64; 2]| v[0] * v[0] + v[1] * v[1];
-        vectors.par_iter().with_min_len(4096).map(square).collect_into_vec(&mut self.lengths2);
+        let lengths2 = self.lengths2.get_mut();
+        vectors.par_iter().with_min_len(4096).map(square).collect_into_vec(lengths2);
         let join = |a: (f64, f64), b: (f64, f64)| (a.0 + b.0, a.1.max(b.1));
-        let (sum, largest2) = chunked(&self.lengths2, (0.0, 0.0), |t, &l2| join(t, (l2, l2)), join);
+        let (sum, largest2) = chunked(lengths2, (0.0, 0.0), |t, &l2| join(t, (l2, l2)), join);
         let n = vectors.len() as f64;
-        let rms = match &matcher.shapes {
+        self.rms = match &matcher.shapes {
             None => (sum / (2.0 * n)).sqrt(),
             Some(shapes) => {
                 let across = |(v, &j): (&[f64; 2], &u32)| {
                     let normal = shapes[j as usize].normal;
                     (normal[0] * v[0] + normal[1] * v[1]).powi(2)
                 };
-                (vectors.iter().zip(&self.target).map(across).sum::<f64>() / n).sqrt()
+                (vectors.iter().zip(&pairs.target).map(across).sum::<f64>() / n).sqrt()
             }
         };
-        let middle = self.lengths2.len() / 2;
-        let (_, median2, _) = self.lengths2.select_nth_unstable_by(middle, f64::total_cmp);
-        // The median length of normally distributed vectors is 1.1774 σ.
-        Residuals { rms, squares: sum, robust_sigma: median2.sqrt() / 1.1774, largest: largest2.sqrt() }
+        self.squares = sum;
+        self.largest = largest2.sqrt();
+        self.robust_sigma = OnceCell::new();
     }
-}
 
-/// What the pairs leave.
-pub(super) struct Residuals {
-    /// The sum of their squared lengths.
-    pub squares: f64,
-    /// Per coordinate; across the lines where these are what is minimised.
-    pub rms: f64,
-    /// Per coordinate, from the median length.
-    pub robust_sigma: f64,
-    /// The largest length.
-    pub largest: f64,
+    /// Per coordinate, from the median length. Found when it is asked for: a fixed threshold needs it once.
+    pub fn robust_sigma(&self) -> f64 {
+        *self.robust_sigma.get_or_init(|| {
+            let mut lengths2 = self.lengths2.borrow_mut();
+            let middle = lengths2.len() / 2;
+            let (_, median2, _) = lengths2.select_nth_unstable_by(middle, f64::total_cmp);
+            // The median length of normally distributed vectors is 1.1774 σ.
+            median2.sqrt() / 1.1774
+        })
+    }
 }
 
 impl<'a> Matcher<'a> {
@@ -196,24 +254,22 @@ impl<'a> Matcher<'a> {
 
     /// Makes `pairs` those that count under a transformation and the present threshold.
     pub fn find(&self, pairs: &mut Pairs, transform: &Matrix3<f64>, schedule: &Schedule) -> Result<()> {
-        let Pairs { all, found, .. } = pairs;
-        self.moved(transform, all);
+        let Pairs { all, found, held, .. } = pairs;
         if self.has_covariances() {
+            self.moved(transform, all);
             self.likeliest(transform, all, schedule, found);
         } else {
-            // The partner of the last iteration is near: the search begins with it.
-            found.resize(all.len(), Neighbour::NONE);
-            all.par_iter().zip(found.par_iter_mut()).with_min_len(1024).for_each(|(p, n)| {
-                let mut known = Neighbour { index: NONE, distance2: schedule.threshold * schedule.threshold };
-                if let Some(j) = n.found() {
-                    let y = self.target.points[j];
-                    let distance2 = (p[0] - y[0]).powi(2) + (p[1] - y[1]).powi(2);
-                    if distance2 <= known.distance2 {
-                        known = Neighbour { index: n.index, distance2 };
-                    }
-                }
-                *n = self.index.nearest_from(p, known);
-            });
+            let n = self.source.points.len();
+            all.resize(n, [0.0; 2]);
+            found.resize(n, Neighbour::NONE);
+            held.resize(n, Held::NOTHING);
+            let limit2 = schedule.threshold * schedule.threshold;
+            let partner = |(((source, p), n), held): (((&[f64; 2], &mut [f64; 2]), &mut Neighbour), &mut Held)| {
+                *p = apply(transform, source);
+                *n = held.partner(p, &self.target.points, &self.index, limit2);
+            };
+            let points = self.source.points.par_iter().zip(all.par_iter_mut());
+            points.zip(found.par_iter_mut()).zip(held.par_iter_mut()).with_min_len(1024).for_each(partner);
         }
         if self.options.mutual {
             self.keep_mutual(all, found)?;

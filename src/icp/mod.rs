@@ -18,7 +18,7 @@ use nalgebra::Matrix3;
 
 use crate::error::{Error, Result};
 pub use fit::Motion;
-use matching::{Matcher, Pairs};
+use matching::{Matcher, Pairs, Residuals};
 pub use report::{Finding, FindingKind, Reason, Report, Step};
 use schedule::Schedule;
 
@@ -156,7 +156,7 @@ pub fn run(sets: &Sets, options: &Options) -> Result<Report> {
     let mut schedule =
         Schedule::new(options, matcher.extent(), matcher.reach(), || matcher.first_distances(&transform))?;
     let (mut history, mut earlier) = (Vec::new(), Vec::new());
-    let (mut pairs, mut vectors) = (Pairs::default(), Vec::new());
+    let (mut pairs, mut residuals) = (Pairs::default(), Residuals::default());
     loop {
         matcher.find(&mut pairs, &transform, &schedule)?;
         let least = options.min_pairs.max(options.motion.parameters());
@@ -173,7 +173,7 @@ pub fn run(sets: &Sets, options: &Options) -> Result<Report> {
         let next = next / next[(2, 2)];
         let change = matcher.largest_shift(&transform, &next);
         transform = next;
-        let residuals = pairs.residuals_under(&transform, &matcher, &mut vectors);
+        residuals.take(&pairs, &transform, &matcher);
         history.push(Step { threshold: schedule.threshold, pairs: pairs.len(), rms: residuals.rms, change });
         earlier.push(transform);
         let still = change < options.change_tolerance || swings(&matcher, &earlier, &history);
@@ -184,8 +184,7 @@ pub fn run(sets: &Sets, options: &Options) -> Result<Report> {
                 (true, false) => Reason::ResidualsLarge,
                 (false, _) => Reason::IterationLimit,
             };
-            let left = (residuals, vectors);
-            return report::assess(&matcher, &transform, &pairs, left, history, reason);
+            return report::assess(&matcher, &transform, &pairs, residuals, history, reason);
         }
         schedule.reduce(&residuals);
     }

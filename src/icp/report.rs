@@ -172,7 +172,7 @@ pub(super) fn assess(
     matcher: &Matcher,
     transform: &Matrix3<f64>,
     pairs: &Pairs,
-    (residuals, vectors): (Residuals, Vec<[f64; 2]>),
+    residuals: Residuals,
     history: Vec<Step>,
     reason: Reason,
 ) -> Result<Report> {
@@ -190,7 +190,7 @@ pub(super) fn assess(
     let rows: Vec<_> = here.iter().zip(&weights).map(|(p, w)| (units.local(p), *w)).collect();
     let information = fit::information(&rows, motion.parameters()) * factor;
     let form = |v: &[f64; 2], w: &[f64; 3]| w[0] * v[0] * v[0] + 2.0 * w[1] * v[0] * v[1] + w[2] * v[1] * v[1];
-    let misfit: f64 = which.iter().zip(&weights).map(|(&k, w)| form(&vectors[k], w)).sum();
+    let misfit: f64 = which.iter().zip(&weights).map(|(&k, w)| form(&residuals.vectors[k], w)).sum();
     let dof = observations * factor - motion.parameters() as f64;
     let variance = if dof > 0.0 { misfit * factor / dof } else { f64::NAN };
 
@@ -214,8 +214,8 @@ pub(super) fn assess(
         rms: (residuals.squares / (2.0 * n)).sqrt(),
         rmse: (residuals.squares / n).sqrt(),
         sigma0: variance.sqrt(),
-        distinctness: distinctness(matcher, transform, 3.0 * residuals.robust_sigma),
-        residuals: vectors,
+        distinctness: distinctness(matcher, transform, 3.0 * residuals.robust_sigma()),
+        residuals: residuals.vectors,
         history,
         reason,
         findings: Vec::new(),

@@ -44,7 +44,7 @@ impl Schedule {
 
     /// Where the reduction stops: as given, or three sigmas of what the residuals are.
     fn end(&self, residuals: &Residuals) -> f64 {
-        self.end.unwrap_or((3.0 * residuals.robust_sigma).max(self.least))
+        self.end.unwrap_or((3.0 * residuals.robust_sigma()).max(self.least))
     }
 
     /// Whether a smaller threshold would change nothing.

@@ -10,6 +10,7 @@ use nalgebra::{Matrix3, Vector3};
 use rayon::prelude::*;
 
 use crate::error::{Error, Result};
+use crate::memory::fresh;
 
 /// The powers of range and of the cosine of incidence that an intensity follows.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -81,25 +82,43 @@ pub fn fit_exponents(intensity: &[f32], ranges: &[f32], cosines: &[f32]) -> Resu
 /// The intensity as it would be at the median range and at normal incidence.
 pub fn corrected(intensity: &[f32], ranges: &[f32], cosines: &[f32], exponents: &Exponents) -> Result<Vec<f32>> {
     check(intensity, ranges, cosines)?;
-    let mut sorted: Vec<f32> = ranges.iter().copied().filter(|r| *r > 0.0 && r.is_finite()).collect();
-    if sorted.is_empty() {
-        return Ok(intensity.to_vec());
-    }
-    let middle = sorted.len() / 2;
-    let reference = f64::from(*sorted.select_nth_unstable_by(middle, f32::total_cmp).1);
-    Ok((0..intensity.len())
-        .into_par_iter()
-        .with_min_len(4096)
-        .map(|i| {
-            let range = f64::from(ranges[i]);
-            let mut factor =
-                if range > 0.0 && range.is_finite() { (range / reference).powf(-exponents.range) } else { 1.0 };
-            if let Some(cosine) = cosines.get(i).filter(|c| c.is_finite()) {
-                factor *= f64::from(*cosine).abs().max(LEAST_COSINE).powf(-exponents.incidence);
-            }
-            (f64::from(intensity[i]) * factor) as f32
+    let Some(reference) = median_range(ranges) else { return Ok(intensity.to_vec()) };
+    let reference = f64::from(reference);
+    let mut out: Vec<f32> = fresh(intensity.len());
+    out.par_iter_mut().enumerate().with_min_len(4096).for_each(|(i, out)| {
+        let range = f64::from(ranges[i]);
+        let mut factor =
+            if range > 0.0 && range.is_finite() { (range / reference).powf(-exponents.range) } else { 1.0 };
+        if let Some(cosine) = cosines.get(i).filter(|c| c.is_finite()) {
+            factor *= f64::from(*cosine).abs().max(LEAST_COSINE).powf(-exponents.incidence);
+        }
+        *out = (f64::from(intensity[i]) * factor) as f32;
+    });
+    Ok(out)
+}
+
+/// Of the positive, finite ranges the middle one. The bits of positive floats are in the numbers' order: a histogram of their
+/// upper half leaves few to be looked at.
+fn median_range(ranges: &[f32]) -> Option<f32> {
+    const DROPPED: u32 = 16;
+    let usable = |r: &&f32| **r > 0.0 && r.is_finite();
+    let bin = |r: &f32| (r.to_bits() >> DROPPED) as usize;
+    let counts = ranges
+        .par_chunks(1 << 20)
+        .map(|part| {
+            let mut counts = vec![0usize; 1 << (31 - DROPPED)];
+            part.iter().filter(usable).for_each(|r| counts[bin(r)] += 1);
+            counts
         })
-        .collect())
+        .reduce_with(|a, b| a.iter().zip(&b).map(|(a, b)| a + b).collect())?;
+    let mut rank = counts.iter().sum::<usize>() / 2;
+    let middle = counts.iter().position(|&count| {
+        let within = rank < count;
+        rank -= if within { 0 } else { count };
+        within
+    })?;
+    let mut bin: Vec<f32> = ranges.par_iter().filter(usable).filter(|r| bin(r) == middle).copied().collect();
+    Some(*bin.select_nth_unstable_by(rank, f32::total_cmp).1)
 }
 
 fn check(intensity: &[f32], ranges: &[f32], cosines: &[f32]) -> Result<()> {
@@ -193,6 +212,17 @@ mod tests {
             let mean = ratios.iter().sum::<f64>() / ratios.len() as f64;
             let spread = (ratios.iter().map(|r| (r - mean).powi(2)).sum::<f64>() / ratios.len() as f64).sqrt();
             assert!(spread < 0.05, "{spread}");
+        }
+    }
+
+    #[test]
+    fn the_median_range_is_that_of_the_sorted_ones() {
+        for n in [0, 1, 2, 1001, 4000] {
+            let mut ranges: Vec<f32> = (0..n).map(|i| (5.0 + 45.0 * noise(i)) as f32).collect();
+            let mut sorted = ranges.clone();
+            sorted.sort_by(f32::total_cmp);
+            ranges.extend([f32::NAN, f32::INFINITY, 0.0, -1.0]);
+            assert_eq!(median_range(&ranges), sorted.get(n / 2).copied());
         }
     }
 

@@ -5,8 +5,8 @@
 //! than 1.5 times the time when the points are shuffled.
 #![allow(clippy::unwrap_used, missing_docs, reason = "a bench")]
 
-use colourreg::render::sci::front;
-use colourreg::render::{Footprint, IndexBuffer};
+use colourreg::render::sci::{Hiding, draw, front};
+use colourreg::render::{Footprint, IndexBuffer, Splat};
 use criterion::{Criterion, criterion_group, criterion_main};
 
 mod walls;
@@ -28,8 +28,13 @@ fn sci(c: &mut Criterion) {
     let buffer = IndexBuffer::new(view).unwrap();
     buffer.add(&in_order, 0).unwrap();
     let footprint = Footprint::new(None, None).unwrap();
-    group.bench_function("front of the buffer, nothing hides", |b| b.iter(|| front(&buffer, None)));
-    group.bench_function("front of the buffer, surfaces hide", |b| b.iter(|| front(&buffer, Some(&footprint))));
+    group.bench_function("front of the buffer, nothing hides", |b| b.iter(|| front(&buffer, Hiding::Nothing)));
+    group.bench_function("front of the buffer, surfaces hide", |b| {
+        b.iter(|| front(&buffer, Hiding::Surfaces(&footprint)))
+    });
+    let (values, splat) = (vec![1.0; in_order.len()], Splat::new(3).unwrap());
+    group.bench_function("depth and values, points", |b| b.iter(|| draw(&buffer, Splat::POINT, &values)));
+    group.bench_function("depth and values, splats of 3 x 3", |b| b.iter(|| draw(&buffer, splat, &values)));
     group.finish();
 }
 

@@ -1,12 +1,13 @@
 """How fast is a synthetic camera image of 10 million points in 12 megapixels, against NumPy and numba?
 
 The job: project all points with distortion, keep the nearest in each pixel, and give its depth and its intensity; once
-with footprints of one pixel and once so that near surfaces hide what shines through between their points. For the
-latter NumPy and numba write each point into 3 x 3 pixels; colourreg finds the surfaces between the points, which also
-holds where gaps are wider than that. Points in the order of the scan and shuffled. All contenders run in turn in
-processes of their own on the same input; numba's compilation is not timed, nor is any import. Depths are compared with
-NumPy's. Limits: a made-up building of walls at four distances; a machine that does other things moves all figures, the
-ratios less.
+with footprints of one pixel and once with each point drawn into 3 x 3 pixels, so that near surfaces hide some of what
+shines through between their points. What colourreg does by default instead, finding the surfaces between the points, also
+holds where gaps are wider than that; it has a row of its own, and so has the whole of `render_sci`, which corrects and
+stretches the intensity, fills holes and gives each point's index and place as well. Points in the order of the scan and
+shuffled. All contenders run in turn in processes of their own on the same input; numba's compilation is not timed, nor is
+any import. Depths are compared with NumPy's. Limits: a made-up building of walls at four distances; a machine that does
+other things moves all figures, the ratios less.
 
     python -m benches.peers.sci [--points 10000000] [--repeats 3]
 """
@@ -54,15 +55,31 @@ def by_colourreg(xyz, intensity, footprint):
 
     buffer = _core.IndexBuffer(building.view(WIDTH, HEIGHT))
     buffer.add(xyz)
-    if footprint == 1:
-        depth, index = buffer.images()
-    else:
-        index, inverse, _ = _core.sci_front(buffer)
-        with np.errstate(divide="ignore"):
-            depth = np.divide(1.0, inverse, out=inverse)
+    return buffer.draw(intensity, splat=footprint)
+
+
+def by_surfaces(xyz, intensity, footprint):
+    from colourreg_rs import _core
+
+    buffer = _core.IndexBuffer(building.view(WIDTH, HEIGHT))
+    buffer.add(xyz)
+    index, inverse, _ = _core.sci_front(buffer)
+    with np.errstate(divide="ignore"):
+        depth = np.divide(1.0, inverse, out=inverse)
     grey = intensity[index]  # -1 takes the last one, which the next line takes out
     grey[index < 0] = 0
     return depth, grey
+
+
+def by_render_sci(xyz, intensity, footprint):
+    from colourreg_rs import Camera, PointCloud, Pose, View
+    from colourreg_rs.sci import render_sci
+
+    names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+    params = dict(zip(names, building.camera(WIDTH, HEIGHT).tolist(), strict=True))
+    view = View("bench", "", camera=Camera("OPENCV", WIDTH, HEIGHT, params), pose=Pose(np.eye(3), np.zeros(3)))
+    sci = render_sci(PointCloud(xyz, intensity=intensity), view)
+    return sci.depth, sci.raw
 
 
 def numba_kernels():
@@ -125,6 +142,14 @@ def colourreg(points, order, footprint):
     return _timed(by_colourreg, points, order, footprint, check=int(points) <= 2_000_000 and footprint == "1")
 
 
+def colourreg_surfaces(points, order, footprint):
+    return _timed(by_surfaces, points, order, footprint)
+
+
+def colourreg_render_sci(points, order, footprint):
+    return _timed(by_render_sci, points, order, footprint)
+
+
 def numpy_minimum_at(points, order, footprint):
     return _timed(by_numpy, points, order, footprint)
 
@@ -145,9 +170,11 @@ def main() -> None:
     ours = {}
     for footprint in ("1", "3"):
         for order in ("scan", "shuffled"):
-            what = "one pixel" if footprint == "1" else "3 x 3 pixels, colourreg: surfaces"
+            what = "one pixel" if footprint == "1" else "3 x 3 pixels"
             print(f"\n{arguments.points:,} points in {WIDTH} x {HEIGHT}, footprints of {what}, in {order} order")
-            figures = compare(contenders, [str(arguments.points), order, footprint], arguments.repeats)
+            extra = {"colourreg, surfaces": colourreg_surfaces, "colourreg, render_sci": colourreg_render_sci}
+            all_of_them = contenders if footprint == "1" else {**contenders, **extra}
+            figures = compare(all_of_them, [str(arguments.points), order, footprint], arguments.repeats)
             ours[footprint, order] = figures[0].seconds
     for footprint in ("1", "3"):
         ratio = ours[footprint, "shuffled"] / ours[footprint, "scan"]

@@ -135,12 +135,24 @@ class IndexBuffer:
     def images(self) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]:
         """Depth (H, W), NaN where empty, and index (H, W), −1 where empty."""
 
+    def draw(
+        self, values: npt.NDArray[np.float32], *, splat: int = 1
+    ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+        """Depth (H, W) and value (H, W) of the nearest point, NaN where empty; ``values`` (N,) are those of all points.
+        With ``splat`` (odd, 7 at most) each point is drawn as a square of so many pixels. Raises InvalidInputError."""
+
 def sci_front(
-    buffer: IndexBuffer, *, hide: bool = True, tolerance: float | None = None, max_gap: float | None = None
+    buffer: IndexBuffer,
+    *,
+    hide: bool = True,
+    splat: int | None = None,
+    tolerance: float | None = None,
+    max_gap: float | None = None,
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float32], npt.NDArray[np.float32]]:
     """The points of a buffer that no surface hides: index (H, W), -1 where there is none; inverse depth (H, W), 0
     likewise; and limit (H, W): whatever has a smaller inverse depth here is hidden, 0 where nothing hides. Without
-    ``hide`` every pixel keeps its nearest point. ``tolerance`` and ``max_gap`` as in :class:`DepthBuffer`."""
+    ``hide`` every pixel keeps its nearest point. With ``splat`` (odd, 7 at most) no surfaces are found: each point is
+    drawn as a square of so many pixels, and what it hides is what it is drawn over. ``tolerance`` and ``max_gap`` as in :class:`DepthBuffer`."""
 
 def sci_gather(
     view: View,

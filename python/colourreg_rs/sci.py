@@ -95,6 +95,7 @@ def render_sci(
     station: npt.ArrayLike | None = None,
     exponents: tuple[float, float] | None = None,
     hide: bool = True,
+    splat: int | None = None,
     tolerance: float | None = None,
     max_gap: float | None = None,
     fill: int = 8,
@@ -111,6 +112,9 @@ def render_sci(
         exponents: the powers of range and of the cosine of incidence that the intensity follows. By default they are
             found in the data; ``(0, 0)`` leaves the intensity as it is.
         hide: whether surfaces hide the points that shine through between their own.
+        splat: draw each point as a square of so many pixels (odd, 7 at most), as simple renderers do, instead of finding
+            the surfaces between the points. Faster; but gaps wider than the square let far points shine through, the
+            outlines of near things grow, and ``subpixel`` reaches beyond the pixel.
         tolerance: noise of the depths, relative; what is in front by less hides nothing.
         max_gap: the widest gap between the points of a surface that still hides, px.
         fill: the widest hole to be filled, px; 0 fills none.
@@ -137,7 +141,7 @@ def render_sci(
         source = "intensity" if has_intensity else "colour" if has_colour else None
     if (source == "intensity" and not has_intensity) or (source == "colour" and not has_colour):
         raise InvalidInputError(f"the cloud has no {source} to show")
-    index, inverse, limit = _core.sci_front(buffer, hide=hide, tolerance=tolerance, max_gap=max_gap)
+    index, inverse, limit = _core.sci_front(buffer, hide=hide, splat=splat, tolerance=tolerance, max_gap=max_gap)
     del buffer
 
     offset = np.full((*shape, 2), np.nan, np.float32)
@@ -167,23 +171,24 @@ def render_sci(
     if source == "colour":
         exponents = (0.0, 0.0) if exponents is None else exponents
     if source is not None and exponents != (0.0, 0.0) and measured.any():
-        seen_values, seen_ranges = value[measured], ranges[measured]
-        seen_cosines = cosine[measured] if has_normals else None
         if exponents is None:
-            exponents = _core.fit_exponents(seen_values, seen_ranges, seen_cosines)
-        value[measured] = _core.correct_intensity(seen_values, seen_ranges, seen_cosines, *exponents)
+            seen_cosines = cosine[measured] if has_normals else None
+            exponents = _core.fit_exponents(value[measured], ranges[measured], seen_cosines)
+        # Where nothing was measured all three are NaN, and stay so.
+        cosines = cosine.reshape(-1) if has_normals else None
+        value = _core.correct_intensity(value.reshape(-1), ranges.reshape(-1), cosines, *exponents).reshape(shape)
     if fill > 0:
         wraps = core.model == "EQUIRECTANGULAR"
         filled = _core.sci_fill(inverse, limit, width=fill, wraps=wraps)
         holes = (filled > 0) & ~measured
         if source is not None and holes.any():
             at_centres = _core.sci_resample(value, offset, filled, sigma=CENTRE_SIGMA, widest=float(fill), gaps=True)
-            value[holes] = at_centres[holes]
+            np.copyto(value, at_centres, where=holes)
             filled[holes & ~np.isfinite(value)] = 0.0
     else:
         filled = inverse
-    with np.errstate(divide="ignore"):
-        depth = np.where(filled > 0, 1.0 / filled, np.nan).astype(np.float32)
+    depth = np.full(shape, np.nan, np.float32)
+    np.divide(np.float32(1.0), filled, out=depth, where=filled > 0)
     grey = _core.stretch_by_rank(value.reshape(-1), 2**bits - 1).reshape(shape)
     return SCI(
         view=view,

@@ -2,15 +2,15 @@
 
 use std::sync::RwLock;
 
-use numpy::PyArray2;
+use numpy::{Element, PyArray2};
 use pyo3::prelude::*;
 
-use super::arrays::{owned, points3};
+use super::arrays::{Input, owned, points3};
 use super::colour::PyVisibilityMap;
 use super::geometry::PyView;
 use crate::colour::{Limits, VisibilityMap};
 use crate::error::Error;
-use crate::render::{DepthBuffer, Footprint, IndexBuffer};
+use crate::render::{DepthBuffer, Footprint, IndexBuffer, Splat, sci};
 
 /// The buffer until it is finished. Adding shares the lock, finishing has it alone.
 #[pyclass(frozen, name = "DepthBuffer", module = "colourreg_rs._core")]
@@ -83,12 +83,31 @@ impl PyIndexBuffer {
         Ok(py.detach(|| self.0.add(points, first))?)
     }
 
-    #[allow(clippy::type_complexity, reason = "two arrays")]
-    fn images<'py>(&self, py: Python<'py>) -> PyResult<(Bound<'py, PyArray2<f32>>, Bound<'py, PyArray2<i64>>)> {
+    fn images<'py>(&self, py: Python<'py>) -> PyResult<(Image<'py, f32>, Image<'py, i64>)> {
+        let (depth, index) = py.detach(|| sci::images(&self.0));
+        Ok((self.image(py, depth)?, self.image(py, index)?))
+    }
+
+    #[pyo3(signature = (values, *, splat=1))]
+    fn draw<'py>(
+        &self,
+        py: Python<'py>,
+        values: &Bound<'py, PyAny>,
+        splat: usize,
+    ) -> PyResult<(Image<'py, f32>, Image<'py, f32>)> {
+        let input = Input::<f32>::new(values, "values", &[None])?;
+        let (values, splat) = (input.values()?, Splat::new(splat)?);
+        let (depth, picture) = py.detach(|| sci::draw(&self.0, splat, values))?;
+        Ok((self.image(py, depth)?, self.image(py, picture)?))
+    }
+}
+
+type Image<'py, T> = Bound<'py, PyArray2<T>>;
+
+impl PyIndexBuffer {
+    fn image<'py, T: Element>(&self, py: Python<'py>, pixels: Vec<T>) -> PyResult<Image<'py, T>> {
         let grid = self.0.grid();
-        let (depth, index) =
-            py.detach(|| self.0.pixels().map(|(depth, index)| (depth, index.map_or(-1, i64::from))).unzip());
-        Ok((owned(py, depth, [grid.height, grid.width])?, owned(py, index, [grid.height, grid.width])?))
+        owned(py, pixels, [grid.height, grid.width])
     }
 }
 

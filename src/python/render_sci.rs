@@ -6,25 +6,31 @@ use pyo3::prelude::*;
 use super::arrays::{Input, Output, owned, points3, vector};
 use super::geometry::PyView;
 use super::render::PyIndexBuffer;
-use crate::render::Footprint;
 use crate::render::filling::{Filling, Samples, filled};
 use crate::render::intensity::{self, Exponents};
 use crate::render::resampling::{Scattered, resampled};
-use crate::render::sci::{self, Gathered, Points};
+use crate::render::sci::{self, Gathered, Hiding, Points};
+use crate::render::{Footprint, Splat};
 
 type Front<'py> = (Bound<'py, PyArray2<i64>>, Bound<'py, PyArray2<f32>>, Bound<'py, PyArray2<f32>>);
 
 #[pyfunction]
-#[pyo3(signature = (buffer, *, hide=true, tolerance=None, max_gap=None))]
+#[pyo3(signature = (buffer, *, hide=true, splat=None, tolerance=None, max_gap=None))]
 fn sci_front<'py>(
     py: Python<'py>,
     buffer: &PyIndexBuffer,
     hide: bool,
+    splat: Option<usize>,
     tolerance: Option<f64>,
     max_gap: Option<f64>,
 ) -> PyResult<Front<'py>> {
-    let footprint = if hide { Some(Footprint::new(tolerance, max_gap)?) } else { None };
-    let front = py.detach(|| sci::front(&buffer.0, footprint.as_ref()))?;
+    let footprint = Footprint::new(tolerance, max_gap)?;
+    let hiding = match (hide, splat) {
+        (true, Some(size)) => Hiding::Splats(Splat::new(size)?),
+        (true, None) => Hiding::Surfaces(&footprint),
+        (false, _) => Hiding::Nothing,
+    };
+    let front = py.detach(|| sci::front(&buffer.0, hiding))?;
     let shape = [front.height, front.width];
     Ok((owned(py, front.index, shape)?, owned(py, front.inverse_depth, shape)?, owned(py, front.limit, shape)?))
 }

@@ -94,10 +94,9 @@ impl Surfaces {
         Self::from_samples(&view, grid, buffer.into_samples(), PLACE, footprint)
     }
 
-    /// From the inverse depths in the cells of a grid, of points at the pixels' centres.
-    pub fn from_inverse_depth(view: &View, grid: Grid, inverse_depth: Vec<f32>, footprint: &Footprint) -> Result<Self> {
-        let centred = |&v: &f32| if v > 0.0 { Sample::new(v, [0.5, 0.5]) } else { Sample::default() };
-        Self::from_samples(view, grid, inverse_depth.par_iter().map(centred).collect(), ANYWHERE, footprint)
+    /// From the samples in the cells of a grid, of points of which nothing is known but their pixels.
+    pub(super) fn from_centred(view: &View, grid: Grid, samples: Vec<Sample>, footprint: &Footprint) -> Result<Self> {
+        Self::from_samples(view, grid, samples, ANYWHERE, footprint)
     }
 
     fn from_samples(

@@ -2,6 +2,7 @@
 //! surfaces that hide what lies behind; and the synthetic camera image (SCI), the photo that the scanner would have taken
 //! in its own light.
 
+mod drawing;
 mod extremes;
 pub mod filling;
 mod footprint;
@@ -16,6 +17,7 @@ mod sample;
 pub mod sci;
 mod zbuffer;
 
+pub use drawing::Splat;
 pub(crate) use footprint::pixel_angle;
 pub use footprint::{Footprint, Surfaces};
 pub use planes::LocalPlanes;

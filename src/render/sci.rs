@@ -7,15 +7,21 @@
 //! [`super::resampling`]. Every value is a function of the finished buffer and of the points alone, so that neither
 //! chunks nor threads can be seen in it.
 
+use std::sync::atomic::{AtomicBool, Ordering};
+
 use rayon::prelude::*;
 
+use super::drawing::{Splat, each_row};
 use super::footprint::{Footprint, Surfaces};
-use super::zbuffer::IndexBuffer;
+use super::zbuffer::{IndexBuffer, fetch, nearest_of};
 use crate::error::{Error, Result};
 use crate::geometry::View;
+use crate::memory::fresh;
 
 /// Where no point is.
 pub const EMPTY: i64 = -1;
+/// How far ahead of its use a point is fetched, pixels.
+const AHEAD: usize = 24;
 
 /// The points in front, pixel by pixel.
 #[derive(Debug, Clone, PartialEq)]
@@ -32,33 +38,97 @@ pub struct Front {
     pub limit: Vec<f32>,
 }
 
-/// The points that no surface hides. Without a footprint every pixel keeps its nearest point.
-pub fn front(buffer: &IndexBuffer, footprint: Option<&Footprint>) -> Result<Front> {
+/// What keeps far points from shining through between the points of near surfaces.
+#[derive(Debug, Clone, Copy)]
+pub enum Hiding<'a> {
+    /// Nothing: every pixel keeps its nearest point.
+    Nothing,
+    /// Each point is drawn as a square of fixed size, as simple renderers do: a pixel shows the nearest point whose square
+    /// covers it, which may lie in a pixel beside it.
+    Splats(Splat),
+    /// Surfaces that are found between the points, whatever their spacing; a pixel shows its own point or none.
+    Surfaces(&'a Footprint),
+}
+
+/// The points in front.
+pub fn front(buffer: &IndexBuffer, hiding: Hiding) -> Result<Front> {
     let grid = buffer.grid();
     let (width, height) = (grid.width, grid.height);
-    let mut index = vec![EMPTY; width * height];
-    let mut inverse_depth = vec![0.0f32; width * height];
-    let mut limit = vec![0.0f32; width * height];
-    let surfaces = footprint
-        .map(|footprint| Surfaces::from_inverse_depth(buffer.view(), grid, buffer.inverse_depth(), footprint))
-        .transpose()?;
-    index
-        .par_chunks_mut(width)
-        .zip(inverse_depth.par_chunks_mut(width))
-        .zip(limit.par_chunks_mut(width))
-        .enumerate()
-        .for_each(|(y, ((index, inverse), limit))| {
-            if let Some(surfaces) = &surfaces {
-                limit.copy_from_slice(grid.photo_row(&surfaces.limit, y));
+    let mut index: Vec<i64> = fresh(width * height);
+    let mut inverse_depth: Vec<f32> = fresh(width * height);
+    let mut limit: Vec<f32> = fresh(width * height);
+    let splat = if let Hiding::Splats(splat) = hiding { splat } else { Splat::POINT };
+    let surfaces = match hiding {
+        Hiding::Surfaces(footprint) => Some(Surfaces::from_centred(buffer.view(), grid, buffer.samples(), footprint)?),
+        _ => None,
+    };
+    let rows = index.par_chunks_mut(width).zip(inverse_depth.par_chunks_mut(width)).zip(limit.par_chunks_mut(width));
+    each_row(buffer, splat, rows, |y, cells, ((index, inverse), limit)| {
+        let pixels = index.iter_mut().zip(inverse).zip(cells);
+        let Some(surfaces) = &surfaces else {
+            for ((index, inverse), &cell) in pixels {
+                let (found, point) = nearest_of(cell);
+                *inverse = found;
+                *index = if cell == 0 { EMPTY } else { i64::from(point) };
             }
-            for (x, (found, point)) in buffer.row(y).enumerate() {
-                if found > 0.0 && found >= limit[x] {
-                    inverse[x] = found;
-                    index[x] = i64::from(point);
-                }
-            }
-        });
+            return;
+        };
+        limit.copy_from_slice(grid.photo_row(&surfaces.limit, y));
+        for (((index, inverse), &cell), &limit) in pixels.zip(&*limit) {
+            let (found, point) = nearest_of(cell);
+            let seen = found > 0.0 && found >= limit;
+            *inverse = if seen { found } else { 0.0 };
+            *index = if seen { i64::from(point) } else { EMPTY };
+        }
+    });
     Ok(Front { width, height, index, inverse_depth, limit })
+}
+
+/// The plain picture: of the nearest point in each pixel the depth and one value, NaN where there is none. `values` are
+/// those of the whole cloud, by the points' indices.
+pub fn draw(buffer: &IndexBuffer, splat: Splat, values: &[f32]) -> Result<(Vec<f32>, Vec<f32>)> {
+    let grid = buffer.grid();
+    let mut depth: Vec<f32> = fresh(grid.width * grid.height);
+    let mut picture: Vec<f32> = fresh(grid.width * grid.height);
+    let missing = AtomicBool::new(false);
+    let rows = depth.par_chunks_mut(grid.width).zip(picture.par_chunks_mut(grid.width));
+    each_row(buffer, splat, rows, |_, cells, (depth, picture)| {
+        for (x, ((depth, value), &cell)) in depth.iter_mut().zip(picture).zip(cells).enumerate() {
+            if let Some(&ahead) = cells.get(x + AHEAD) {
+                fetch(values, nearest_of(ahead).1);
+            }
+            let (inverse, point) = nearest_of(cell);
+            *depth = if cell == 0 { f32::NAN } else { 1.0 / inverse };
+            *value = match values.get(point as usize) {
+                Some(value) if cell != 0 => *value,
+                None if cell != 0 => {
+                    missing.store(true, Ordering::Relaxed);
+                    f32::NAN
+                }
+                _ => f32::NAN,
+            };
+        }
+    });
+    if missing.into_inner() {
+        return Err(Error::invalid(format!("{} values are fewer than the points of the buffer", values.len())));
+    }
+    Ok((depth, picture))
+}
+
+/// The nearest point's depth (NaN where empty) and index ([`EMPTY`] where empty), pixel by pixel.
+pub fn images(buffer: &IndexBuffer) -> (Vec<f32>, Vec<i64>) {
+    let grid = buffer.grid();
+    let mut depth: Vec<f32> = fresh(grid.width * grid.height);
+    let mut index: Vec<i64> = fresh(grid.width * grid.height);
+    let rows = depth.par_chunks_mut(grid.width).zip(index.par_chunks_mut(grid.width));
+    each_row(buffer, Splat::POINT, rows, |_, cells, (depth, index)| {
+        for ((depth, index), &cell) in depth.iter_mut().zip(index).zip(cells) {
+            let (inverse, point) = nearest_of(cell);
+            *depth = if cell == 0 { f32::NAN } else { 1.0 / inverse };
+            *index = if cell == 0 { EMPTY } else { i64::from(point) };
+        }
+    });
+    (depth, index)
 }
 
 /// A cloud, or a chunk of it.
@@ -118,6 +188,11 @@ pub fn gather(view: &View, index: &[i64], station: &[f64; 3], points: &Points, o
         .enumerate()
         .for_each(|(y, ((((index, offset), intensity), range), cosine))| {
             for (x, &point) in index.iter().enumerate() {
+                if let Some(ahead) = index.get(x + AHEAD) {
+                    let ahead = (ahead - points.first) as u32;
+                    fetch(points.xyz, ahead);
+                    fetch(points.intensity, ahead);
+                }
                 let Ok(i) = usize::try_from(point - points.first) else { continue };
                 if point < 0 || i >= n {
                     continue;
@@ -168,14 +243,14 @@ mod tests {
             .collect()
     }
 
-    fn rendered(xyz: &[[f64; 3]], chunks: usize, footprint: Option<&Footprint>) -> (Front, Vec<[f32; 2]>, Vec<f32>) {
+    fn rendered(xyz: &[[f64; 3]], chunks: usize, hiding: Hiding) -> (Front, Vec<[f32; 2]>, Vec<f32>) {
         let view = view();
         let buffer = IndexBuffer::new(view).unwrap();
         let size = xyz.len().div_ceil(chunks);
         for (k, chunk) in xyz.chunks(size).enumerate() {
             buffer.add(chunk, (k * size) as u64).unwrap();
         }
-        let front = front(&buffer, footprint).unwrap();
+        let front = front(&buffer, hiding).unwrap();
         let n = front.index.len();
         let (mut offset, mut range) = (vec![[f32::NAN; 2]; n], vec![f32::NAN; n]);
         let (mut intensity, mut cosine) = (vec![f32::NAN; n], vec![f32::NAN; n]);
@@ -191,7 +266,7 @@ mod tests {
     #[test]
     fn index_offset_and_depth_are_those_of_the_point() {
         let (xyz, view) = (cloud(), view());
-        let (front, offset, range) = rendered(&xyz, 1, Some(&Footprint::default()));
+        let (front, offset, range) = rendered(&xyz, 1, Hiding::Surfaces(&Footprint::default()));
         let mut seen = 0;
         for (i, &point) in front.index.iter().enumerate().filter(|(_, p)| **p >= 0) {
             let (xy, depth) = view.project(&xyz[point as usize]).unwrap();
@@ -209,13 +284,43 @@ mod tests {
     fn the_wall_does_not_shine_through_the_board() {
         // 10,000 points on about 44 × 44 pixels, thinned until one pixel in five is empty.
         let xyz: Vec<[f64; 3]> = cloud().into_iter().enumerate().filter(|(i, _)| i % 4 != 0).map(|(_, p)| p).collect();
-        let through = |footprint| {
-            let (front, _, _) = rendered(&xyz, 1, footprint);
+        let through = |hiding| {
+            let (front, _, _) = rendered(&xyz, 1, hiding);
             let inside = (32..58).flat_map(|y| (47..73).map(move |x| y * 120 + x));
             inside.filter(|i| front.index[*i] >= 0 && front.inverse_depth[*i] < 0.15).count()
         };
-        assert!(through(None) > 20, "{}", through(None));
-        assert_eq!(through(Some(&Footprint::default())), 0);
+        assert!(through(Hiding::Nothing) > 20, "{}", through(Hiding::Nothing));
+        assert_eq!(through(Hiding::Surfaces(&Footprint::default())), 0);
+    }
+
+    #[test]
+    fn splats_show_the_nearest_of_the_points_whose_squares_cover_a_pixel() {
+        let xyz = cloud();
+        let buffer = IndexBuffer::new(view()).unwrap();
+        buffer.add(&xyz[..2000], 0).unwrap();
+        let single = front(&buffer, Hiding::Nothing).unwrap();
+        let values: Vec<f32> = (0..2000).map(|i| i as f32).collect();
+        for size in [1, 3, 7] {
+            let splat = Splat::new(size).unwrap();
+            let splats = front(&buffer, Hiding::Splats(splat)).unwrap();
+            let (depth, picture) = draw(&buffer, splat, &values).unwrap();
+            let reach = size / 2;
+            // Beside the border lie points of the margin.
+            for (y, x) in (reach..90 - reach).flat_map(|y| (reach..120 - reach).map(move |x| (y, x))) {
+                let around = (y - reach..=y + reach).flat_map(|v| (x - reach..=x + reach).map(move |u| v * 120 + u));
+                let best = around.map(|i| (single.inverse_depth[i], -single.index[i])).filter(|b| b.0 > 0.0);
+                let best = best.max_by(|a, b| a.partial_cmp(b).unwrap()).unwrap_or((0.0, -EMPTY));
+                let i = y * 120 + x;
+                assert_eq!((splats.inverse_depth[i], -splats.index[i]), best, "{size}: {x} {y}");
+                if best.0 > 0.0 {
+                    assert_eq!((depth[i], picture[i]), (1.0 / best.0, -best.1 as f32));
+                } else {
+                    assert!(depth[i].is_nan() && picture[i].is_nan());
+                }
+            }
+        }
+        assert!(draw(&buffer, Splat::POINT, &values[..100]).is_err());
+        assert!(Splat::new(2).is_err() && Splat::new(9).is_err());
     }
 
     #[test]
@@ -223,7 +328,7 @@ mod tests {
         let xyz = cloud();
         let run = |threads: usize, chunks: usize| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            pool.install(|| rendered(&xyz, chunks, Some(&Footprint::default())))
+            pool.install(|| rendered(&xyz, chunks, Hiding::Surfaces(&Footprint::default())))
         };
         let bits = |(front, offset, range): (Front, Vec<[f32; 2]>, Vec<f32>)| {
             let offset: Vec<_> = offset.iter().map(|o| o.map(f32::to_bits)).collect();

@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use super::sample::Sample;
 use crate::error::{Error, Result};
 use crate::geometry::{Block, BlockProjector, Frustum, LANES, Model, View};
-use crate::memory::zeros;
+use crate::memory::{fresh, zeros};
 
 /// Points per task of the scheduler.
 const TASK: usize = 16 * LANES;
@@ -346,26 +346,29 @@ impl IndexBuffer {
         self.grid
     }
 
-    /// The inverse depths, 0 where empty, as a [`DepthBuffer`] of the same points has them.
-    pub fn inverse_depth(&self) -> Vec<f32> {
-        self.cells.par_iter().map(|c| f32::from_bits((c.load(Ordering::Relaxed) >> 32) as u32)).collect()
-    }
-
-    /// A row of the photo's pixels: inverse depth, 0 where empty, and index.
-    pub(super) fn row(&self, row: usize) -> impl Iterator<Item = (f32, u32)> + '_ {
-        self.grid.photo_row(&self.cells, row).iter().map(|cell| {
-            let bits = cell.load(Ordering::Relaxed);
-            (f32::from_bits((bits >> 32) as u32), !(bits as u32))
-        })
-    }
-
-    /// The photo's pixels, row by row: depth (NaN where empty) and index (`None` where empty).
-    pub fn pixels(&self) -> impl Iterator<Item = (f32, Option<u32>)> + '_ {
-        (0..self.grid.height).flat_map(|row| self.grid.photo_row(&self.cells, row)).map(|cell| {
-            match cell.load(Ordering::Relaxed) {
-                0 => (f32::NAN, None),
-                bits => (1.0 / f32::from_bits((bits >> 32) as u32), Some(!(bits as u32))),
+    /// Samples of the inverse depths, of points at their pixels' centres.
+    pub(super) fn samples(&self) -> Vec<Sample> {
+        let mut samples: Vec<Sample> = fresh(self.cells.len());
+        samples.par_iter_mut().zip(&self.cells).with_min_len(1 << 14).for_each(|(sample, cell)| {
+            let inverse = nearest_of(cell.load(Ordering::Relaxed)).0;
+            if inverse > 0.0 {
+                *sample = Sample::new(inverse, [0.5, 0.5]);
             }
-        })
+        });
+        samples
     }
+
+    /// Copies cells of one row, from a column and a row of the photo on that may lie [`PAD`] beside it.
+    pub(super) fn copy_row(&self, row: isize, column: isize, out: &mut [u64]) {
+        let start = self.grid.cell(0, 0) as isize + row * self.grid.stride() as isize + column;
+        for (out, cell) in out.iter_mut().zip(&self.cells[start as usize..]) {
+            *out = cell.load(Ordering::Relaxed);
+        }
+    }
+}
+
+/// The inverse depth, 0 in an empty cell, and the index that a cell of an [`IndexBuffer`] holds.
+#[inline(always)]
+pub(super) fn nearest_of(cell: u64) -> (f32, u32) {
+    (f32::from_bits((cell >> 32) as u32), !(cell as u32))
 }

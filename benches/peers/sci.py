@@ -1,13 +1,13 @@
 """How fast is a synthetic camera image of 10 million points in 12 megapixels, against NumPy and numba?
 
-The job: project all points with distortion, keep the nearest in each pixel, and give its depth and its intensity; once
-with footprints of one pixel and once with each point drawn into 3 x 3 pixels, so that near surfaces hide some of what
-shines through between their points. What colourreg does by default instead, finding the surfaces between the points, also
-holds where gaps are wider than that; it has a row of its own, and so has the whole of `render_sci`, which corrects and
-stretches the intensity, fills holes and gives each point's index and place as well. Points in the order of the scan and
-shuffled. All contenders run in turn in processes of their own on the same input; numba's compilation is not timed, nor is
-any import. Depths are compared with NumPy's. Limits: a made-up building of walls at four distances; a machine that does
-other things moves all figures, the ratios less.
+The job: project all points with distortion, keep the nearest in each pixel, and give its depth and its intensity;
+once with footprints of one pixel and once with each point drawn into 3 x 3 pixels, so that near surfaces hide some of
+what shines through between their points. What colourreg does by default instead, finding the surfaces between the
+points, also holds where gaps are wider than that; it has a row of its own, and so has the whole of `render_sci`,
+which corrects and stretches the intensity, fills holes and gives each point's index and place as well. Points in the
+order of the scan and shuffled. All contenders run in turn in processes of their own on the same input; numba's
+compilation is not timed, nor is any import. Depths are compared with NumPy's. Limits: a made-up building of walls at
+four distances; a machine that does other things moves all figures, the ratios less.
 
     python -m benches.peers.sci [--points 10000000] [--repeats 3]
 """

@@ -152,7 +152,8 @@ def sci_front(
     """The points of a buffer that no surface hides: index (H, W), -1 where there is none; inverse depth (H, W), 0
     likewise; and limit (H, W): whatever has a smaller inverse depth here is hidden, 0 where nothing hides. Without
     ``hide`` every pixel keeps its nearest point. With ``splat`` (odd, 7 at most) no surfaces are found: each point is
-    drawn as a square of so many pixels, and what it hides is what it is drawn over. ``tolerance`` and ``max_gap`` as in :class:`DepthBuffer`."""
+    drawn as a square of so many pixels, and what it hides is what it is drawn over. ``tolerance`` and ``max_gap`` as in
+    :class:`DepthBuffer`."""
 
 def sci_gather(
     view: View,

@@ -112,9 +112,9 @@ def render_sci(
         exponents: the powers of range and of the cosine of incidence that the intensity follows. By default they are
             found in the data; ``(0, 0)`` leaves the intensity as it is.
         hide: whether surfaces hide the points that shine through between their own.
-        splat: draw each point as a square of so many pixels (odd, 7 at most), as simple renderers do, instead of finding
-            the surfaces between the points. Faster; but gaps wider than the square let far points shine through, the
-            outlines of near things grow, and ``subpixel`` reaches beyond the pixel.
+        splat: draw each point as a square of so many pixels (odd, 7 at most), as simple renderers do, instead of
+            finding the surfaces between the points. Faster; but gaps wider than the square let far points shine
+            through, the outlines of near things grow, and ``subpixel`` reaches beyond the pixel.
         tolerance: noise of the depths, relative; what is in front by less hides nothing.
         max_gap: the widest gap between the points of a surface that still hides, px.
         fill: the widest hole to be filled, px; 0 fills none.

@@ -15,7 +15,7 @@ use super::drawing::{Splat, each_row};
 use super::footprint::{Footprint, Surfaces};
 use super::zbuffer::{IndexBuffer, fetch, nearest_of};
 use crate::error::{Error, Result};
-use crate::geometry::View;
+use crate::geometry::{Model, View};
 use crate::memory::fresh;
 
 /// Where no point is.
@@ -159,6 +159,7 @@ pub struct Gathered<'a> {
 pub fn gather(view: &View, index: &[i64], station: &[f64; 3], points: &Points, out: Gathered) -> Result<()> {
     let n = points.xyz.len();
     let width = view.camera.width as usize;
+    let wraps = view.camera.model() == Model::Equirectangular;
     let pixels = width * view.camera.height as usize;
     for (name, length) in [
         ("index", index.len()),
@@ -199,8 +200,12 @@ pub fn gather(view: &View, index: &[i64], station: &[f64; 3], points: &Points, o
                 }
                 let p = &points.xyz[i];
                 if let Some((xy, _)) = view.project(p) {
-                    // A panorama's point just left of the border may have been rounded into the last column.
-                    offset[x] = [(xy[0] - x as f64) as f32, (xy[1] - y as f64) as f32];
+                    let mut right = xy[0] - x as f64;
+                    if wraps && right.abs() > 0.5 * width as f64 {
+                        // A splat, or a point just left of the border that was rounded into the last column.
+                        right -= (width as f64).copysign(right);
+                    }
+                    offset[x] = [right as f32, (xy[1] - y as f64) as f32];
                 }
                 let ray: [f64; 3] = std::array::from_fn(|k| p[k] - station[k]);
                 let norm = |v: &[f64; 3]| (v[0] * v[0] + v[1] * v[1] + v[2] * v[2]).sqrt();
@@ -222,7 +227,7 @@ mod tests {
     use nalgebra::{Matrix3, Vector3};
 
     use super::*;
-    use crate::geometry::{Camera, Model, Pose};
+    use crate::geometry::{Camera, Pose};
 
     fn view() -> View {
         let camera = Camera::new(Model::OpenCv, 120, 90, &[110.0, 110.0, 59.5, 44.5, -0.1, 0.02, 1e-3, 0.0, 0.0]);

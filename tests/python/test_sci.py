@@ -75,6 +75,21 @@ def test_an_sci_shows_what_the_camera_sees(model, rng):
     assert sci.intensity.dtype == np.uint8 and sci.intensity.max() == 255
 
 
+@pytest.mark.parametrize("model", ["OPENCV", "EQUIRECTANGULAR"])
+def test_splats_are_squares_about_the_points(model, rng):
+    cloud = box(rng, 5_000)
+    view = View("v", None, CAMERAS[model], Pose.from_centre(np.eye(3), [0.3, -0.2, 0.1]))
+    sci = render_sci(cloud, view, splat=3, fill=0)
+    plain = render_sci(cloud, view, hide=False, fill=0)
+    assert sci.measured.sum() > 3 * plain.measured.sum()
+    assert np.abs(sci.subpixel[sci.measured]).max() <= 1.5 + 1e-6
+    assert (sci.depth[plain.measured] <= plain.depth[plain.measured]).all()
+    xyz = cloud.xyz[sci.index[sci.measured]]
+    assert np.abs(_core.project(view.core, xyz)[1] / sci.depth[sci.measured] - 1).max() < 1e-6
+    with pytest.raises(InvalidInputError, match="odd"):
+        render_sci(cloud, view, splat=2)
+
+
 def test_intensity_at_the_centres_does_not_follow_the_points_about(rng):
     """A wall sampled once for each pixel: drawn as it is the pattern is torn, at the centres it is not."""
     n = 60_000

@@ -264,12 +264,13 @@ impl<'a> Matcher<'a> {
             found.resize(n, Neighbour::NONE);
             held.resize(n, Held::NOTHING);
             let limit2 = schedule.threshold * schedule.threshold;
-            let points = self.source.points.par_iter().zip(all.par_iter_mut());
-            let each = points.zip(found.par_iter_mut()).zip(held.par_iter_mut()).with_min_len(1024);
-            each.for_each(|(((source, p), n), held)| {
+            #[allow(clippy::type_complexity, reason = "what zipping gives")]
+            let partner = |(((source, p), n), held): (((&[f64; 2], &mut [f64; 2]), &mut Neighbour), &mut Held)| {
                 *p = apply(transform, source);
                 *n = held.partner(p, &self.target.points, &self.index, limit2);
-            });
+            };
+            let points = self.source.points.par_iter().zip(all.par_iter_mut());
+            points.zip(found.par_iter_mut()).zip(held.par_iter_mut()).with_min_len(1024).for_each(partner);
         }
         if self.options.mutual {
             self.keep_mutual(all, found)?;

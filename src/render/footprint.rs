@@ -26,7 +26,7 @@ use crate::geometry::View;
 use crate::memory::zeros;
 
 /// How surfaces are told from gaps, and how much in front "in front" is. The defaults were set on simulated scans, where
-/// they lose about one visible point in a hundred and pass one or two hidden ones.
+/// they lose about two visible points in a hundred and pass one or two hidden ones.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Footprint {
     /// What is in front by less than this part of the depth hides nothing; `None` for what the noise of the depths
@@ -46,7 +46,7 @@ pub struct Footprint {
 
 impl Default for Footprint {
     fn default() -> Self {
-        Self { tolerance: None, steepest: 20.0, gap_ratio: 2.0, row_ratio: 4.0, inner: 0.9, max_gap: 32.0 }
+        Self { tolerance: None, steepest: 20.0, gap_ratio: 2.0, row_ratio: 6.0, inner: 0.9, max_gap: 32.0 }
     }
 }
 

@@ -440,7 +440,9 @@ impl<'a> Surroundings<'a> {
         let spacing = patch.spacing();
         let mut farthest = 0.0;
         for (k, link) in patch.links.iter().enumerate() {
-            let rows = smaller(2.0 * patch.links[(k + 2) % QUADRANTS].distance, self.row_ratio * spacing);
+            let (opposite, rows) = (patch.links[(k + 2) % QUADRANTS], self.row_ratio * spacing);
+            // Between the rows of a grazing scan both are missing at first, and neither is to wait for the other.
+            let rows = if opposite.found() { smaller(2.0 * opposite.distance, rows) } else { rows };
             let reach = larger(rows, self.gap_ratio * spacing);
             farthest = if link.found() { farthest } else { larger(farthest, reach) };
         }

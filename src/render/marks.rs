@@ -7,9 +7,9 @@ use super::zbuffer::Grid;
 
 /// The farthest that a mark reaches, rows.
 pub(super) const MAX_REACH: usize = 64;
-/// How far beyond its last sample a surface reaches, as a part of the distance to the neighbour before it, and less by
-/// some of a pixel, so that bars of the width of a pixel do not grow.
-const OUTER: (f32, f32) = (0.9, 0.15);
+/// How far beyond its last sample a surface reaches, as a part of the distance to the neighbour before it: up to one whole
+/// distance is possible, and what is behind the rim would be coloured when it is taken for less.
+const OUTER: f32 = 0.9;
 /// The least that a sample covers, cells.
 const LEAST: f32 = 0.1;
 
@@ -66,7 +66,7 @@ impl Rule {
         let mut covered = [0.0_f32; QUADRANTS];
         for (k, covered) in covered.iter_mut().enumerate() {
             let (link, opposite) = (&patch.links[k], &patch.links[(k + 2) % QUADRANTS]);
-            let end = OUTER.0 * (if opposite.found() { opposite.distance } else { spacing }) - OUTER.1;
+            let end = OUTER * if opposite.found() { opposite.distance } else { spacing };
             let reach = if link.found() { self.inner * link.distance } else { end };
             *covered = smaller(larger(reach, LEAST), MAX_REACH as f32 - 1.0);
         }

@@ -7,6 +7,7 @@
 //!
 //! Between points at the same distance the grid takes the lower index; the tree takes one of them, always the same.
 
+mod approach;
 mod grid;
 mod order;
 mod tree;
@@ -16,6 +17,7 @@ use std::sync::OnceLock;
 use rayon::prelude::*;
 
 use crate::error::{Error, Result};
+pub use approach::Approach;
 use grid::Grid;
 pub(crate) use order::along_a_curve;
 use tree::Tree;

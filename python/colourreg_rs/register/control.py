@@ -15,8 +15,8 @@ from ..model import ControlPoint, FloatArray
 from ..overlap import prefetched
 
 #: A control point lies on what was scanned if the nearest point is no farther than so many spacings of the points
-#: there, this share of the control points' own extent, and so many of its sigmas. Twice, and three times, that is far off: a
-#: target's thickness or a sphere's radius, which make points stand off, are not so large.
+#: there, this share of the control points' own extent, and so many of its sigmas. Twice the first and three times the
+#: second is far off: a target's thickness or a sphere's radius, which make points stand off, are not so large.
 SPACINGS, OF_EXTENT, SIGMAS = 5.0, 0.01, 4.0
 FAR_SPACINGS, FAR_OF_EXTENT = 10.0, 0.03
 

@@ -99,7 +99,7 @@ def living_room(data: Path, folder: Path, cloud_of: int, photo_of: int) -> Scene
     t_camera = np.linalg.inv(t_world[photo_of])
     u, _, vt = np.linalg.svd(t_camera[:3, :3])  # six printed digits are no rotation to 1e-6
     image = source / f"color/{photo_of:05d}.jpg"
-    pose = Pose(np.asarray(u @ vt, dtype=np.float64), t_camera[:3, 3])
+    pose = Pose(np.asarray(u @ vt, dtype=np.float64), np.asarray(t_camera[:3, 3], dtype=np.float64))
     view = View(f"frame {photo_of}", image, camera, pose)
 
     depth = read_depth(source / f"depth/{cloud_of:05d}.png")

@@ -48,12 +48,19 @@ class Scene:
 
 
 def _write(
-    folder: Path, cloud: PointCloud, views: list[View], suffix: str = ".ply", **truth: npt.NDArray[Any] | None
+    folder: Path,
+    cloud: PointCloud,
+    views: list[View],
+    suffix: str = ".ply",
+    *,
+    colours: FloatArray | None = None,
+    seen: BoolArray | None = None,
+    hidden: BoolArray | None = None,
 ) -> Scene:
     path, registration = folder / f"cloud{suffix}", folder / "registration.json"
     write_cloud(path, cloud)
     write_registration(registration, Registration(tuple(views), path))
-    return Scene(path, registration, tuple(views), **truth)  # type: ignore[arg-type]
+    return Scene(path, registration, tuple(views), colours, seen, hidden)
 
 
 def kinect(data: Path, name: str, folder: Path) -> Scene:
@@ -74,8 +81,8 @@ def kinect(data: Path, name: str, folder: Path) -> Scene:
         PointCloud(cloud.xyz),
         [view],
         colours=photo.reshape(-1, 3).astype(np.float64),
-        seen=valid,
-        hidden=~valid,
+        seen=np.asarray(valid),
+        hidden=np.asarray(~valid),
     )
 
 
@@ -92,7 +99,8 @@ def living_room(data: Path, folder: Path, cloud_of: int, photo_of: int) -> Scene
     t_camera = np.linalg.inv(t_world[photo_of])
     u, _, vt = np.linalg.svd(t_camera[:3, :3])  # six printed digits are no rotation to 1e-6
     image = source / f"color/{photo_of:05d}.jpg"
-    view = View(f"frame {photo_of}", image, camera, Pose(u @ vt, t_camera[:3, 3]))
+    pose = Pose(np.asarray(u @ vt, dtype=np.float64), np.asarray(t_camera[:3, 3], dtype=np.float64))
+    view = View(f"frame {photo_of}", image, camera, pose)
 
     depth = read_depth(source / f"depth/{cloud_of:05d}.png")
     row, column = np.nonzero(depth)
@@ -102,7 +110,7 @@ def living_room(data: Path, folder: Path, cloud_of: int, photo_of: int) -> Scene
     colours = read_photo(source / f"color/{cloud_of:05d}.jpg").pixels[row, column].astype(np.float64)
 
     other = read_depth(source / f"depth/{photo_of:05d}.png")
-    in_camera = xyz @ view.pose.rotation.T + view.pose.translation  # type: ignore[union-attr]
+    in_camera = xyz @ pose.rotation.T + pose.translation
     with np.errstate(divide="ignore", invalid="ignore"):  # points in the plane of the camera
         xy = 525 * in_camera[:, :2] / in_camera[:, 2:] + [319.5, 239.5]
     inside = (in_camera[:, 2] > 0) & (xy >= 1).all(1) & (xy < [638, 478]).all(1)

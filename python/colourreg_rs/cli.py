@@ -18,6 +18,9 @@ from . import __version__
 from .errors import ColourregError, FileError
 from .progress import terminal_bars
 
+#: What a command ends with that was stopped by Ctrl-C, as shells have it.
+INTERRUPTED = 130
+
 if TYPE_CHECKING:
     from .model import ControlPoint, Registration
 
@@ -58,6 +61,13 @@ class Sampling(StrEnum):
 
     bilinear = "bilinear"
     bicubic = "bicubic"
+
+
+class Bits(StrEnum):
+    """How finely a grey picture is told."""
+
+    eight = "8"
+    sixteen = "16"
 
 
 def _write_json(path: Path | None, result: dict[str, Any] | list[Any]) -> None:
@@ -150,7 +160,11 @@ def simulate(
 ) -> None:
     """A scan and photos whose truth is known, with errors put in by hand."""
     _refuse_outputs([json_file], folder=out)
+    from .io.atomic import refuse_foreign_files
     from .simulate import simulate_from_text
+    from .simulate.write import BEGINNING, MARK, PATTERNS
+
+    refuse_foreign_files(out, PATTERNS, MARK, BEGINNING)
 
     with terminal_bars() as progress:
         files, description = simulate_from_text(
@@ -203,7 +217,7 @@ def sci(
     cloud: Annotated[Path, typer.Argument(help="The laser scan.")],
     view: Annotated[Path, typer.Option(help="A registration with the view to render (JSON).")],
     out: Annotated[Path, typer.Option(help="Folder for the pictures.")],
-    bits: Annotated[int, typer.Option(help="Of the intensity picture: 8 or 16.")] = 8,
+    bits: Annotated[Bits, typer.Option(help="Of the intensity picture: 8 or 16.")] = Bits.eight,
     fill: Annotated[int, typer.Option(help="The widest hole to be filled, pixels; 0 fills none.", min=0, max=256)] = 8,
     tolerance: ToleranceOption = None,
     json_file: JsonOption = None,
@@ -223,7 +237,7 @@ def sci(
     points = read_cloud(cloud)
     result = []
     for one, folder in zip(registration.views, folders, strict=True):
-        image = render_sci(points, one, bits=bits, fill=fill, tolerance=tolerance)  # type: ignore[arg-type]
+        image = render_sci(points, one, bits=16 if bits is Bits.sixteen else 8, fill=fill, tolerance=tolerance)
         if not image.measured.any():
             raise FileError(view, f"no point of {cloud} lies in view {one.name!r}", "check its pose, frame and unit")
         write_sci(folder, image)
@@ -425,7 +439,11 @@ def reproduce(
     """The experiments of the paper that this package began with, beside its figures and this package's own."""
     _refuse_outputs([json_file], folder=out)
     from .experiments import reproduce as run
+    from .experiments.reproduce import BEGINNING, MARK, PATTERNS
+    from .io.atomic import refuse_foreign_files
 
+    if out is not None:
+        refuse_foreign_files(out, PATTERNS, MARK, BEGINNING)
     with terminal_bars() as progress:
         result = run(experiment, progress)
     print(result.text())
@@ -446,9 +464,12 @@ def main() -> None:
     except ColourregError as error:
         print(f"colourreg: {error}", file=sys.stderr)
         sys.exit(1)
-    except KeyboardInterrupt:
-        print("colourreg: interrupted; nothing was written", file=sys.stderr)
-        sys.exit(130)
+    except (KeyboardInterrupt, SystemExit) as end:
+        # The library of the command line turns Ctrl-C into an exit of its own, without a word.
+        if isinstance(end, SystemExit) and end.code != INTERRUPTED:
+            raise
+        print("colourreg: interrupted; no unfinished file was left", file=sys.stderr)
+        sys.exit(INTERRUPTED)
     except BrokenPipeError:
         sys.exit(1)
     except MemoryError:

@@ -8,6 +8,7 @@
 //!
 //! Between points at the same distance the grid takes the lower index; the tree takes one of them, always the same.
 
+mod approach;
 mod grid;
 mod order;
 mod tree;
@@ -18,6 +19,7 @@ use rayon::prelude::*;
 
 use crate::error::{Error, Result};
 use crate::memory::fresh;
+pub use approach::Approach;
 use grid::Grid;
 pub(crate) use order::along_a_curve;
 use tree::Tree;

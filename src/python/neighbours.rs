@@ -1,13 +1,15 @@
 //! Nearest neighbours.
 
+use std::sync::{Mutex, MutexGuard};
+
 use numpy::{PyArray1, PyArray2};
 use pyo3::prelude::*;
 use rayon::prelude::*;
 
 use super::arrays::{Input, owned, points2, points3};
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::memory::fresh;
-use crate::neighbours::{NONE, Neighbour, Neighbours, Within};
+use crate::neighbours::{Approach, NONE, Neighbour, Neighbours, Within};
 
 enum Index {
     Plane(Neighbours<2>),
@@ -104,6 +106,42 @@ impl PyNeighbours {
     }
 }
 
+#[pyclass(frozen, name = "Approach", module = "colourreg_rs._core")]
+pub(super) struct PyApproach(Mutex<Approach>);
+
+impl PyApproach {
+    fn lock(&self) -> Result<MutexGuard<'_, Approach>> {
+        self.0.lock().map_err(|_| Error::Internal("a thread panicked while adding".into()))
+    }
+}
+
+#[pymethods]
+impl PyApproach {
+    #[new]
+    fn new(places: &Bound<'_, PyAny>) -> PyResult<Self> {
+        let input = points3(places, "places")?;
+        Ok(Self(Mutex::new(Approach::new(input.rows::<3>()?)?)))
+    }
+
+    fn add(&self, py: Python<'_>, xyz: &Bound<'_, PyAny>) -> PyResult<()> {
+        let input = points3(xyz, "xyz")?;
+        let points = input.rows::<3>()?;
+        py.detach(|| {
+            self.lock()?.add(points);
+            Ok(())
+        })
+    }
+
+    fn distances<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray1<f64>>> {
+        Ok(PyArray1::from_vec(py, self.lock()?.distances()))
+    }
+
+    fn spacings<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray1<f64>>> {
+        Ok(PyArray1::from_vec(py, self.lock()?.spacings()))
+    }
+}
+
 pub(super) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
-    m.add_class::<PyNeighbours>()
+    m.add_class::<PyNeighbours>()?;
+    m.add_class::<PyApproach>()
 }

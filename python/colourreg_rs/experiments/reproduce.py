@@ -22,6 +22,11 @@ CAPTIONS = {
 }
 
 
+#: The names of the files, and how a folder is known that an earlier run filled.
+PATTERNS = ("README.md", "results.json", "table1-*.jpg", "table2-*.jpg")
+MARK, BEGINNING = "README.md", "# The paper's experiments, made again"
+
+
 @dataclass(frozen=True)
 class Reproduction:
     """What was found; a table that was not asked for is ``None``."""
@@ -53,7 +58,7 @@ class Reproduction:
         done = [name for name, part in (("table1", self.table1), ("table2", self.table2)) if part is not None]
         command = f"colourreg reproduce {'all' if len(done) == 2 else done[0]} --out FOLDER"
         page = [
-            "# The paper's experiments, made again",
+            BEGINNING,
             "",
             "Lim, Bae and Belton, *Semi-Automated Colour Registration and Evaluation of Digital Photogrammetry and "
             "Terrestrial Laser Scanning*.",

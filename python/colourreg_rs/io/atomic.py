@@ -130,6 +130,27 @@ def refuse_outputs(
             raise FileError(folder, "is a file, and a folder is to be written", "name another folder")
 
 
+def refuse_foreign_files(folder: Path, patterns: Iterable[str], mark: str, beginning: str) -> None:
+    """Files of a folder that a command fills are replaced where an earlier run of it made them, and never others.
+
+    Args:
+        folder: where it writes.
+        patterns: the names that it writes.
+        mark: the file by which a folder of its own is known.
+        beginning: what that file begins with, white space apart.
+
+    Raises FileError.
+    """
+    if not folder.is_dir():
+        return
+    with contextlib.suppress(OSError, UnicodeDecodeError), (folder / mark).open(encoding="utf-8") as file:
+        if "".join(file.read(400).split()).startswith("".join(beginning.split())):
+            return
+    for pattern in patterns:
+        for found in sorted(folder.glob(pattern)):
+            raise FileError(found, "is there already and would be replaced", "name a new or an empty folder with --out")
+
+
 def _is_there(path: Path) -> bool:
     try:
         return path.exists()

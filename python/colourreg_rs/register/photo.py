@@ -10,7 +10,7 @@ from ..io.clouds import open_cloud
 from ..io.images import whole_photo_info
 from ..io.points import read_points
 from ..model import Registration
-from .control import check_photo_coordinates, outside_cloud
+from .control import check_photo_coordinates, off_the_scan, outside_cloud
 from .dlt import by_dlt
 from .options import RegisterOptions
 from .resection import by_resection
@@ -74,12 +74,11 @@ def register_photo(
     except NotConvergedError as error:
         remedy = "are the points paired rightly, the axes in order, the frame right-handed?"
         raise FileError(points, str(error), remedy) from error
+    with open_cloud(cloud) as reader:
+        beside, strange = off_the_scan(control, reader)
+    result = replace(result, warnings=(*warnings, *beside, *result.warnings), doubts=(*strange, *result.doubts))
     view = result.view
     if result.doubts:  # whoever uses the file must hear of them
         view = replace(view, statistics={**view.statistics, "doubts": list(result.doubts)})
     registration = Registration((view,), cloud, crs_wkt)
-    return replace(
-        result,
-        registration=registration,
-        warnings=(*warnings, *result.warnings),
-    )
+    return replace(result, registration=registration)

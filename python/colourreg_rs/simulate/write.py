@@ -16,6 +16,13 @@ from ..io.registration import write_camera, write_registration
 from ..model import PointCloud, Registration, View
 from .simulation import Simulation
 
+#: The names of the files, and how a folder is known that an earlier simulation filled.
+PATTERNS = (
+    *("scan.laz", "photo-*.jpg", "photo-*.png", "photo-*-points.csv", "photo-*-camera.json"),
+    *("start.json", "truth.json", "simulation.json"),
+)
+MARK, BEGINNING = "simulation.json", '{"scene":'
+
 
 def write_simulation(simulation: Simulation, folder: str | Path, *, cloud: str = "scan.laz") -> list[Path]:
     """Writes scan, photos, approximate views and control points, and the truth; returns the files.

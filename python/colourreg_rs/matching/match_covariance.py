@@ -6,11 +6,11 @@ everywhere. Taken as independent, a thousand matches promise a tenth of the erro
 - the sandwich ``H⁻¹ G H⁻¹``, whose filling ``G`` sums the products of the matches' gradients *with those of their
   neighbours*, weighted by a Gaussian of their distance in the photo (Conley 1999), and is raised for the number of
   parameters that the fit has taken from so many independent places;
-- an error common to all matches, a shift of the whole SCI by a share of its pixel, which no residual shows;
+- an error common to all matches of pictures, a shift of the whole SCI by a share of its pixel, which no residual shows;
 - and a factor for what errs alike wherever the same is built.
 
 The patches of the last step (:mod:`.pointwise`) are treated like matches: their gradients sum up in ``G``, their
-information in ``H``.
+information in ``H``. They read the photo at the points' own places, and have no such shift.
 
 How well this holds is measured by ``python -m colourreg_rs.experiments.sci_accuracy``.
 """
@@ -24,9 +24,9 @@ import numpy as np
 from .. import _core
 from ..model import Covariance, FloatArray, View
 from .parameters import design
-from .pointwise import Patches
+from .pointwise import STRIDE, Patches
 
-#: The distance over which matches err together, as one sigma of a Gaussian and a share of the photo's long side.
+#: The distance over which single matches err together, as one sigma of a Gaussian and a share of the photo's long side.
 CORRELATION_LENGTH = 0.18
 
 #: The error common to all matches, px of the SCI, one sigma in x and in y.
@@ -36,8 +36,13 @@ COMMON = 0.15
 #: above were set on façades and rooms with seeds 0 to 9.
 SYSTEMATIC = 2.5
 
-#: The same two for patches of points, set on façades and rooms with seeds 20 to 23.
-PATCHES_COMMON, PATCHES_SYSTEMATIC = 0.1, 3.3
+#: The same distance for patches of points: of 0.02 to 0.18 the one that makes the true errors on façades and rooms with
+#: seeds 100 to 119 most likely, in both; with it an error common to all was found to be 0.00 px there.
+PATCHES_LENGTH = 0.08
+
+#: The same factor for patches, set with it, beside that of the stride: the patches' information is that of
+#: Gauss-Newton, and so is larger than the curvature of the likelihood by :data:`.pointwise.STRIDE`.
+PATCHES_SYSTEMATIC = 2.0
 
 
 def match_covariance(
@@ -68,29 +73,17 @@ def match_covariance(
     # What a shift of all matches by one px in x, in y, adds to the gradient.
     shifted = np.stack([np.einsum("nki,nk->i", rows, factors[:, :, axis]) for axis in range(2)])
     common = COMMON * pixel
-    return _sandwich(view, names, xy, information, gradients, shifted * common, SYSTEMATIC)
+    return _sandwich(view, names, xy, information, gradients, shifted * common, CORRELATION_LENGTH, SYSTEMATIC)
 
 
-def patch_covariance(view: View, patches: Patches, seen: FloatArray, pixel: float) -> Covariance | None:
-    """The covariance of a view's parameters from ``patches`` at the view; ``None`` where they do not determine them.
-
-    Args:
-        view: the view.
-        patches: what they say of it.
-        seen: (N, 3) points all over the photo, through which an error common to all acts.
-        pixel: the size of the level's pixel in the photo, px.
-    """
-    information = patches.information.sum(0)
-    slopes = design(view, patches.names, seen)
-    slopes = slopes[np.isfinite(slopes).all((1, 2))]
-    normal = np.einsum("nki,nkj->ij", slopes, slopes)
-    if not np.isfinite(information).all() or np.linalg.matrix_rank(normal) < len(patches.names):
+def patch_covariance(view: View, patches: Patches) -> Covariance | None:
+    """The covariance of a view's parameters from ``patches`` at the view; ``None`` where they do not determine them."""
+    if not np.isfinite(patches.information).all():
         return None
-    # The change of the parameters that comes nearest to a shift of all the picture, as a gradient that makes it.
-    shifts = np.linalg.solve(normal, slopes.sum(0).T).T
+    none = np.empty((0, len(patches.names)))
     return _sandwich(
-        view, patches.names, patches.places, patches.information, patches.gradient,
-        shifts @ information * (PATCHES_COMMON * pixel), PATCHES_SYSTEMATIC,
+        view, patches.names, patches.places, patches.information, patches.gradient, none,
+        PATCHES_LENGTH, PATCHES_SYSTEMATIC * STRIDE**2,
     )  # fmt: skip
 
 
@@ -101,10 +94,11 @@ def _sandwich(
     information: FloatArray,
     gradients: FloatArray,
     common: FloatArray,
+    length: float,
     systematic: float,
 ) -> Covariance | None:
-    """``H⁻¹ G H⁻¹`` of information (K, U, U) and gradients (K, U) at places (K, 2), with errors common to all, whose
-    gradients are ``common`` (C, U)."""
+    """``H⁻¹ G H⁻¹`` of information (K, U, U) and gradients (K, U) at places (K, 2), that err together over
+    ``length``, with errors common to all, whose gradients are ``common`` (C, U)."""
     # Columns of length 1 for the numbers' sake.
     size = np.sqrt(np.diagonal(information, axis1=1, axis2=2).sum(0))
     if not (size > 0).all():
@@ -117,14 +111,14 @@ def _sandwich(
         return None
     long_side = max(view.core.width, view.core.height)
     # Dense, but of float32 and of at most some thousand matches.
-    place = (places / (CORRELATION_LENGTH * long_side)).astype(np.float32)
+    place = (places / (length * long_side)).astype(np.float32)
     square = (place**2).sum(1)
     kernel = np.exp(-0.5 * np.maximum(square[:, None] + square[None] - 2 * place @ place.T, 0))
-    filling = gradients.T @ (kernel.astype(np.float64) @ gradients)
+    filling = gradients.T @ (kernel @ gradients.astype(np.float32)).astype(np.float64)
     # Independent places: (Σ w)² / Σ w w' K, each weighing what it contributes; each parameter uses one half of a
     # match's two coordinates.
     weight = np.trace(scaled, axis1=1, axis2=2)
-    independent = float(weight.sum() ** 2 / (weight @ kernel @ weight))
+    independent = float(weight.sum() ** 2 / (weight @ (kernel @ weight.astype(np.float32))))
     correction = independent / max(independent - 0.5 * len(names), 1.0)
     inverse = np.linalg.inv(curvature)
     total = correction * inverse @ filling @ inverse

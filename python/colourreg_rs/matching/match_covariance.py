@@ -6,11 +6,11 @@ everywhere. Taken as independent, a thousand matches promise a tenth of the erro
 - the sandwich ``H⁻¹ G H⁻¹``, whose filling ``G`` sums the products of the matches' gradients *with those of their
   neighbours*, weighted by a Gaussian of their distance in the photo (Conley 1999), and is raised for the number of
   parameters that the fit has taken from so many independent places;
-- an error common to all matches of pictures, a shift of the whole SCI by a share of its pixel, which no residual shows;
+- an error common to all matches, a shift of the whole SCI by a share of its pixel, which no residual shows;
 - and a factor for what errs alike wherever the same is built.
 
 The patches of the last step (:mod:`.pointwise`) are treated like matches: their gradients sum up in ``G``, their
-information in ``H``. They read the photo at the points' own places, and have no such shift.
+information in ``H``.
 
 How well this holds is measured by ``python -m colourreg_rs.experiments.sci_accuracy``.
 """
@@ -37,12 +37,16 @@ COMMON = 0.15
 SYSTEMATIC = 2.5
 
 #: The same distance for patches of points: of 0.02 to 0.18 the one that makes the true errors on façades and rooms with
-#: seeds 100 to 119 most likely, in both; with it an error common to all was found to be 0.00 px there.
+#: seeds 100 to 119 most likely.
 PATCHES_LENGTH = 0.08
 
-#: The same factor for patches, set with it, beside that of the stride: the patches' information is that of
-#: Gauss-Newton, and so is larger than the curvature of the likelihood by :data:`.pointwise.STRIDE`.
-PATCHES_SYSTEMATIC = 2.0
+#: The error common to all patches, px of the level, one sigma in x and in y. In those scenes there is none to be seen;
+#: colours that a camera has put onto a real cloud lay 0.1 px beside its next picture.
+PATCHES_COMMON = 0.06
+
+#: What is left unexplained, as a factor of the variances, found with the length: beside that of the stride, since the
+#: patches' information is that of Gauss-Newton, larger than the likelihood's curvature by :data:`.pointwise.STRIDE`.
+PATCHES_SYSTEMATIC = 1.6
 
 
 def match_covariance(
@@ -76,15 +80,28 @@ def match_covariance(
     return _sandwich(view, names, xy, information, gradients, shifted * common, CORRELATION_LENGTH, SYSTEMATIC)
 
 
-def patch_covariance(view: View, patches: Patches) -> Covariance | None:
-    """The covariance of a view's parameters from ``patches`` at the view; ``None`` where they do not determine them."""
-    if not np.isfinite(patches.information).all():
+def patch_covariance(view: View, patches: Patches, seen: FloatArray, pixel: float) -> Covariance | None:
+    """The covariance of a view's parameters from ``patches`` at the view; ``None`` where they do not determine them.
+
+    Args:
+        view: the view.
+        patches: what they say of it.
+        seen: (N, 3) points all over the photo, through which an error common to all acts.
+        pixel: the size of the level's pixel in the photo, px.
+    """
+    information = patches.information.sum(0)
+    slopes = design(view, patches.names, seen)
+    slopes = slopes[np.isfinite(slopes).all((1, 2))]
+    normal = np.einsum("nki,nkj->ij", slopes, slopes)
+    if not np.isfinite(information).all() or np.linalg.matrix_rank(normal) < len(patches.names):
         return None
-    none = np.empty((0, len(patches.names)))
+    # The change of the parameters that comes nearest to a shift of all the picture, as a gradient that makes it.
+    shifts = np.linalg.solve(normal, slopes.sum(0).T).T
+    factor = PATCHES_SYSTEMATIC * STRIDE**2
+    common = shifts @ information * (PATCHES_COMMON * pixel / np.sqrt(factor))
     return _sandwich(
-        view, patches.names, patches.places, patches.information, patches.gradient, none,
-        PATCHES_LENGTH, PATCHES_SYSTEMATIC * STRIDE**2,
-    )  # fmt: skip
+        view, patches.names, patches.places, patches.information, patches.gradient, common, PATCHES_LENGTH, factor
+    )
 
 
 def _sandwich(

@@ -392,7 +392,7 @@ class _Loop:
         if self.options.single:
             covariance = match_covariance(view, self.names, matches.xyz, matches.xy, matches.covariance, found.pixel)
         else:
-            covariance = patch_covariance(view, self.patches)
+            covariance = patch_covariance(view, self.patches, self.witnesses, found.pixel)
         predicted = float("nan")
         if covariance is None:
             reasons.append("the matches do not determine the view")

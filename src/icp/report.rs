@@ -204,6 +204,7 @@ pub(super) fn assess(
     let weakest = eigen.eigenvalues.imin();
     let strength = eigen.eigenvalues[weakest] / strongest;
 
+    let beside = Beside::of(matcher, transform, 3.0 * residuals.robust_sigma());
     let jacobian = reported_by_increment(transform, motion, &units);
     let mut report = Report {
         transform: *transform,
@@ -214,7 +215,7 @@ pub(super) fn assess(
         rms: (residuals.squares / (2.0 * n)).sqrt(),
         rmse: (residuals.squares / n).sqrt(),
         sigma0: variance.sqrt(),
-        distinctness: distinctness(matcher, transform, 3.0 * residuals.robust_sigma()),
+        distinctness: beside.distinctness(),
         residuals: residuals.vectors,
         history,
         reason,
@@ -222,7 +223,7 @@ pub(super) fn assess(
         units,
         local,
     };
-    let mut findings = Findings { report: &report, matcher, found: Vec::new() };
+    let mut findings = Findings { report: &report, matcher, beside, found: Vec::new() };
     findings.convergence(residuals.rms);
     findings.ambiguity(strength, &eigen.eigenvectors.column(weakest).into_owned());
     findings.pairing();
@@ -237,6 +238,7 @@ pub(super) fn assess(
 struct Findings<'a> {
     report: &'a Report,
     matcher: &'a Matcher<'a>,
+    beside: Beside,
     found: Vec<Finding>,
 }
 
@@ -252,14 +254,18 @@ impl Findings<'_> {
             Reason::ResidualsLarge => {
                 let limit = options.residual_limit;
                 let text =
-                    format!("it stands still with residuals of {rms:.3} px (root mean square), above {limit} px");
+                    format!("it stands still with residuals of {} (root mean square), above {}", px(rms), px(limit));
                 self.add(FindingKind::NotConverged, rms, limit, text);
             }
             Reason::IterationLimit => {
                 let (n, limit) = (self.report.history.len(), options.change_tolerance);
-                let change = self.report.history.last().map_or(f64::NAN, |s| s.change);
-                let text =
-                    format!("after {n} iterations it still moved by {change:.2e} px, or its threshold still fell");
+                let (change, threshold) =
+                    self.report.history.last().map_or((f64::NAN, f64::NAN), |s| (s.change, s.threshold));
+                let text = if change <= limit {
+                    format!("after {n} iterations its threshold, {}, had not yet reached its end", px(threshold))
+                } else {
+                    format!("after {n} iterations it still moved by {}, more than {}", px(change), px(limit))
+                };
                 self.add(FindingKind::NotConverged, change, limit, text);
             }
         }
@@ -296,11 +302,14 @@ impl Findings<'_> {
         }
         let (distinctness, limit) = (self.report.distinctness, DISTINCT * options.keep);
         if distinctness < limit || distinctness.is_nan() {
+            let Beside { here, aside, shift } = self.beside;
+            let how = if aside >= here { "at least as well" } else { "nearly as well" };
             let text = format!(
-                "the sets match nearly as well when the source is shifted aside: {:.0} % of it match here alone, {:.0} % \
-                 are asked for",
-                100.0 * distinctness,
-                100.0 * limit
+                "the sets match {how} when the source is shifted aside: {:.0} % of it have a partner here, {:.0} % when it \
+                 is shifted by {}",
+                100.0 * here,
+                100.0 * aside,
+                px(shift)
             );
             self.add(FindingKind::NotDistinct, distinctness, limit, text);
         }
@@ -352,25 +361,46 @@ impl Findings<'_> {
     }
 }
 
-/// How much better the source matches here than shifted aside, of how much better it could: 1 when every point has a
-/// partner here and none aside, 0 when the place makes no difference.
-fn distinctness(matcher: &Matcher, transform: &Matrix3<f64>, reach: f64) -> f64 {
-    let source = &matcher.source.points;
-    let stride = source.len().div_ceil(SAMPLE);
-    let here: Vec<[f64; 2]> = source.iter().step_by(stride).map(|p| apply(transform, p)).collect();
-    let size = here.iter().flatten().fold(0.0, |m: f64, v| m.max(v.abs()));
-    let reach = reach.max(1e-9 * size);
-    let matched = |shift: [f64; 2]| {
-        let moved: Vec<[f64; 2]> = here.iter().map(|p| [p[0] + shift[0], p[1] + shift[1]]).collect();
-        let found = matcher.index.nearest_in_order(&moved, reach);
-        found.iter().filter(|n| n.found().is_some()).count() as f64 / here.len() as f64
-    };
-    let aside = (0..8).map(|k| f64::from(k) * std::f64::consts::FRAC_PI_4).map(|a| {
-        let (s, c) = a.sin_cos();
-        matched([4.0 * reach * c, 4.0 * reach * s])
-    });
-    let by_chance = aside.fold(0.0, f64::max);
-    (matched([0.0; 2]) - by_chance) / (1.0 - by_chance)
+/// How well the source matches at its place and beside it.
+#[derive(Debug, Clone, Copy)]
+struct Beside {
+    /// Part of the source that has a partner within reach here, and at most when shifted aside.
+    here: f64,
+    aside: f64,
+    /// How far aside.
+    shift: f64,
+}
+
+impl Beside {
+    fn of(matcher: &Matcher, transform: &Matrix3<f64>, reach: f64) -> Self {
+        let source = &matcher.source.points;
+        let stride = source.len().div_ceil(SAMPLE);
+        let here: Vec<[f64; 2]> = source.iter().step_by(stride).map(|p| apply(transform, p)).collect();
+        let size = here.iter().flatten().fold(0.0, |m: f64, v| m.max(v.abs()));
+        let reach = reach.max(1e-9 * size);
+        let shift = 4.0 * reach;
+        let matched = |by: [f64; 2]| {
+            let moved: Vec<[f64; 2]> = here.iter().map(|p| [p[0] + by[0], p[1] + by[1]]).collect();
+            let found = matcher.index.nearest_in_order(&moved, reach);
+            found.iter().filter(|n| n.found().is_some()).count() as f64 / here.len() as f64
+        };
+        let aside = (0..8).map(|k| f64::from(k) * std::f64::consts::FRAC_PI_4).map(|a| {
+            let (s, c) = a.sin_cos();
+            matched([shift * c, shift * s])
+        });
+        Self { aside: aside.fold(0.0, f64::max), here: matched([0.0; 2]), shift }
+    }
+
+    /// How much better it matches here than aside, of how much better it could: 1 when every point has a partner here
+    /// and none aside, 0 when the place makes no difference, negative when it matches better aside.
+    fn distinctness(&self) -> f64 {
+        (self.here - self.aside) / (1.0 - self.aside)
+    }
+}
+
+/// A length for people: three decimals, or, where these would be zero, two digits and their power of ten.
+fn px(length: f64) -> String {
+    if length == 0.0 || length.abs() >= 5e-4 { format!("{length:.3} px") } else { format!("{length:.1e} px") }
 }
 
 /// The change of the transformation that an eigenvector stands for, in words.

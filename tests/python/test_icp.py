@@ -98,6 +98,9 @@ def test_a_wrong_shift_ends_in_a_wrong_scale_and_is_recognised(rng):
         assert error(result.transform, truth, source) > 5
         assert not result.accepted
         recognised += [kind for kind, *_ in result.findings]
+        for kind, text, *_ in result.findings:
+            if kind == "not distinct":
+                assert "have a partner here" in text and "-" not in text, text
     assert {"scale", "not distinct"} & set(recognised)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -14,6 +15,8 @@ from colourreg_rs.experiments.sci_accuracy import STARTS, disturbed, register, s
 from colourreg_rs.io.clouds import write_cloud
 from colourreg_rs.io.images import write_image
 from colourreg_rs.io.registration import read_registration, write_registration
+from colourreg_rs.matching.afar import agreeing_rotations
+from colourreg_rs.matching.correspondences import Correspondences
 from colourreg_rs.matching.match_covariance import match_covariance
 from colourreg_rs.matching.parameters import design
 from colourreg_rs.matching.register_sci import SciOptions, register_sci
@@ -41,6 +44,25 @@ def test_somebody_elses_photo_is_no_registration(rng):
     start = disturbed(case.truth, rng, 0.5, 0.02)
     wrong = register_sci(case.scan, other, start, SciOptions(station=case.station))
     assert not wrong.trusted and wrong.reasons and wrong.view is start
+
+
+def test_the_rotation_that_most_matches_agree_on_comes_first(rng):
+    camera = Camera("PINHOLE", 1200, 800, {"fx": 1000.0, "fy": 1000.0, "cx": 599.5, "cy": 399.5})
+    start = View("v", None, camera, Pose(np.eye(3), np.zeros(3)))
+    turn = cv2.Rodrigues(np.radians([0.0, 3.0, 1.0]))[0]
+    n = 120
+    pixels = rng.uniform([100, 100], [1100, 700], (n, 2))
+    xyz = _core.unproject(start.core, pixels) * rng.uniform(5, 20, (n, 1))
+    # Two fifths follow the rotation, the rest none.
+    xy, _ = _core.project(replace(start, pose=Pose(turn, np.zeros(3))).core, xyz)
+    xy[48:] = pixels[48:] + rng.uniform(-80, 80, (n - 48, 2))
+    found = Correspondences(
+        xyz, xy, np.tile(np.eye(2), (n, 1, 1)), np.arange(n), np.ones(n), np.ones(n), n, {}, 4.0,
+    )  # fmt: skip
+    views = agreeing_rotations(start, found, np.radians(6.0), 2)
+    away = [np.degrees(np.linalg.norm(cv2.Rodrigues(view.pose.rotation @ turn.T)[0])) for view in views]
+    assert len(views) == 2 and away[0] < 0.5 < away[1], away
+    assert all(np.array_equal(view.pose.centre, start.pose.centre) for view in views)
 
 
 def test_unusable_input_is_refused():

@@ -23,6 +23,7 @@ from .. import _core
 from ..errors import DegenerateError, InvalidInputError, NotConvergedError
 from ..model import Covariance, FloatArray, PointCloud, Pose, View
 from ..sci import SCI
+from .afar import agreeing_rotations
 from .correspondences import (
     Correspondences,
     PhotoPyramid,
@@ -43,6 +44,9 @@ OVERSAMPLING = 3.0
 #: The coarsest level has about this many pixels along the long side.
 COARSEST = 300
 
+#: So many different rotations that matches agree on are followed from the start.
+ROTATIONS = 2
+
 #: So many renderings of a level are taken together.
 TOGETHER = 4
 
@@ -52,8 +56,11 @@ LIKE = 0.2
 #: The photo is confirmed in so many patches along its long and its short side.
 PATCHES = (6, 4)
 
-#: So many of them have to come back.
-CONFIRMED = 0.4
+#: So many of them have to come back, as a share, and at least so many have to have something in them.
+CONFIRMED, LEAST_PATCHES = 0.4, 4
+
+#: A view whose predicted error, px per coordinate, is larger is no result.
+WORST = 5.0
 
 
 @dataclass(frozen=True)
@@ -223,11 +230,40 @@ class _Loop:
         radius = int(np.clip(np.ceil(self.options.search * per_radian), 4, 80))
         half = 12 if self.options.single else 24
         found = self._find(view, scale, Search(half=half, radius=radius, cell=8, per_cell=2, hypotheses=3))
-        new = self._consensus(view, found)
-        for unit in (8.0, 3.0, 1.0):
-            new = self._resect(new, found.xyz, found.xy, found.covariance * unit**2, "tukey", False)
+        starts = [view]
+        for new in agreeing_rotations(view, found, self.options.search, 1 if self.options.single else ROTATIONS):
+            starts.append(new)
+            for unit in (8.0, 3.0, 1.0):
+                new = self._resect(new, found.xyz, found.xy, found.covariance * unit**2, "tukey", False)
+            starts.append(new)
+        new = starts[-1] if self.options.single else self._likeliest(starts, scale)
         self.turns.append(Turn(scale, found.templates, len(found), self._moved(view, new)))
         return new
+
+    def _likeliest(self, starts: list[View], scale: float) -> View:
+        """Of several starts the one from which the templates' likeness climbs highest.
+
+        Near walls a rotation explains the matches badly and a resection is led astray by false ones; far away the
+        resection is better. The pictures themselves tell which: at a wrong place hardly anything is alike.
+        """
+        best, most = starts[0], -np.inf
+        seen, reached = list[View](), list[View]()
+        for view in starts:
+            # Rotations often lead a resection to one and the same view, and several starts to one summit.
+            if any(self._moved(view, v) < 1.0 / scale for v in seen):
+                continue
+            seen.append(view)
+            try:
+                new = self._climbed(view, self._surfaces(view, scale, 8), False)
+                if any(self._moved(new, v) < 1.0 / scale for v in reached):
+                    continue
+                reached.append(new)
+                value = float(self._surfaces(new, scale, 2).log_likelihood()[:, 2, 2].sum())
+            except (_LoopError, DegenerateError, NotConvergedError):
+                continue
+            if value > most:
+                best, most = new, value
+        return best
 
     def _surfaces(self, view: View, scale: float, radius: int, offset: int = 0) -> Surfaces:
         found, sci = find_surfaces(
@@ -318,41 +354,6 @@ class _Loop:
         step = max(len(rows) // 2000, 1)
         return np.ascontiguousarray(self.cloud.xyz[sci.index[rows[::step], columns[::step]]])
 
-    def _consensus(self, view: View, found: Correspondences) -> View:
-        """The rotation that most templates agree on, each with the best of its hypotheses, from pairs of matches."""
-        core = view.core
-        towards = found.xyz - core.centre
-        towards /= np.linalg.norm(towards, axis=1)[:, None]
-        seen = _core.unproject(core, found.xy)
-        ok = np.isfinite(seen).all(1)
-        towards, seen, template = towards[ok], seen[ok], found.template[ok]
-        tolerance = max(2.0 * found.pixel / pixels_per_radian(view), np.radians(0.8))
-        rng = np.random.default_rng(0)
-        pairs = rng.integers(0, len(seen), (6000, 2))
-        a, b = pairs.T
-        cos_world, cos_photo = (towards[a] * towards[b]).sum(1), (seen[a] * seen[b]).sum(1)
-        apart = np.arccos(np.clip(cos_photo, -1, 1))
-        fits = np.abs(np.arccos(np.clip(cos_world, -1, 1)) - apart) < tolerance
-        keep = (template[a] != template[b]) & fits & (apart > np.radians(4.0))
-        a, b = a[keep][:1500], b[keep][:1500]
-        if len(a) == 0:
-            return view
-        turns = np.einsum("kij,klj->kil", _frames(towards[a], towards[b]), _frames(seen[a], seen[b]))
-        angle = np.arccos(np.clip((np.trace(turns, axis1=1, axis2=2) - 1) / 2, -1, 1))
-        turns = np.concatenate([np.eye(3)[None], turns[angle < 1.5 * self.options.search]])
-        turned = np.einsum("kij,nj->kni", turns, seen)
-        miss = 1 - np.einsum("kni,ni->kn", turned, towards)
-        score = np.maximum(0, 1 - 2 * miss / tolerance**2)
-        first = np.flatnonzero(np.r_[True, template[1:] != template[:-1]])
-        total = np.maximum.reduceat(score, first, axis=1).sum(1)
-        best = turns[int(np.argmax(total))]
-        pose = view.pose
-        assert pose is not None
-        # x_cam = R X: what was seen in the direction R⁻¹x is in truth in the direction best · R⁻¹x.
-        rotation = pose.rotation @ best.T
-        u, _, v = np.linalg.svd(rotation)
-        return replace(view, pose=Pose.from_centre(u @ v, core.centre))
-
     def _resect(
         self, view: View, xyz: FloatArray, xy: FloatArray, covariance: FloatArray, loss: str, final: bool
     ) -> View:
@@ -398,22 +399,36 @@ class _Loop:
         else:
             predicted = self._predicted_error(view, covariance)
             view = replace(view, covariance=covariance)
-            if predicted > 5.0:
-                reasons.append(f"the predicted error over the photo is {predicted:.1f} px; the matches are too few")
+            if predicted > WORST:
+                reasons.append(
+                    f"the predicted error over the photo is {predicted:.1f} px; at most {WORST:.0f} px is believed"
+                )
         # A view that moves by less than its own error stands still.
-        if not self.options.single and last.moved >= max(self.options.tolerance, predicted):
-            reasons.append(f"the view still moves by {last.moved:.2f} px after {len(self.turns)} turns")
-        confirmed, within, by_chance, patches = self._confirmed(view)
-        if patches < 4 or confirmed < max(CONFIRMED, 5 * by_chance):
+        still = max(self.options.tolerance, predicted) if np.isfinite(predicted) else self.options.tolerance
+        if not self.options.single and last.moved >= still:
+            reasons.append(
+                f"the view still moves by {last.moved:.2f} px after {len(self.turns)} turns, more than {still:.2f} px"
+            )
+        confirmed, within, by_chance, patches, found_here = self._confirmed(view)
+        needed = max(CONFIRMED, 5 * by_chance)
+        if patches < LEAST_PATCHES:
+            reasons.append(
+                f"only {patches} of the photo's {PATCHES[0] * PATCHES[1]} patches show enough of the cloud to be "
+                f"searched; at least {LEAST_PATCHES} are needed"
+            )
+        elif confirmed < needed:
             reasons.append(
                 f"of {patches} patches of the photo searched over a wide window {100 * confirmed:.0f} % come back to "
-                f"within {within:.1f} px of their place, and {100 * CONFIRMED:.0f} % are needed; by chance it would be "
+                f"within {within:.1f} px of their place; {100 * needed:.0f} % are needed, and by chance it would be "
                 f"{100 * by_chance:.0f} %"
             )
-        improvement = self._improvement(view)
-        if improvement[0] < -2 * improvement[1]:
+        improvement = self._improvement(found_here)
+        if not np.isfinite(improvement[0]) and improvement[0] < 0:
+            reasons.append("at the view no template of the cloud's picture lies in the photo; at the start some do")
+        elif improvement[0] < -2 * improvement[1]:
             reasons.append(
-                f"the start fits better: mean likeness {improvement[0]:+.4f} ± {improvement[1]:.4f} against it"
+                f"the start fits better: its templates are alike by {-improvement[0]:.4f} ± {improvement[1]:.4f} more "
+                f"on average"
             )
         statistics = {
             "matches": len(found), "used": used, "turns": len(self.turns), "confirmed": confirmed,
@@ -440,15 +455,23 @@ class _Loop:
         variances = np.einsum("nij,jk,nik->ni", rows, covariance.matrix, rows)
         return float(np.sqrt(variances.mean())) if len(rows) else float("nan")
 
-    def _confirmed(self, view: View) -> tuple[float, float, float, int]:
-        """Patches of the photo, searched a dozen pixels around one level up, each for itself: how many come back."""
-        scale = self.turns[-1].scale * (0.5 if self.turns[-1].scale * self.long_side > COARSEST else 1.0)
+    def _one_up(self) -> float:
+        """The scale of the level above the last, or the last where it is the coarsest."""
+        scale = self.turns[-1].scale
+        return scale * (0.5 if scale * self.long_side > COARSEST else 1.0)
+
+    def _confirmed(self, view: View) -> tuple[float, float, float, int, FloatArray]:
+        """Patches of the photo, searched a dozen pixels around one level up, each for itself: how many come back.
+
+        Also returns the likeness of all templates without a shift.
+        """
+        scale = self._one_up()
         radius, within = 12, 1.5
         by_chance = float(np.pi * within**2 / (2 * radius + 1) ** 2)
         try:
             found = self._surfaces(view, scale, radius)
         except (DegenerateError, _LoopError):
-            return 0.0, within / scale, by_chance, 0
+            return 0.0, within / scale, by_chance, 0, np.empty(0)
         wide, high = PATCHES if found.size[0] >= found.size[1] else PATCHES[::-1]
         share = found.places * found.scale / found.size
         patch = (share[:, 1] * high).astype(int) * wide + (share[:, 0] * wide).astype(int)
@@ -459,26 +482,15 @@ class _Loop:
             if len(mine) >= 4:
                 row, column = np.divmod(int(np.argmax(mine.sum(0))), 2 * radius + 1)
                 back.append(np.hypot(row - radius, column - radius) <= within)
-        return float(np.mean(back)) if back else 0.0, within / scale, by_chance, len(back)
+        return float(np.mean(back)) if back else 0.0, within / scale, by_chance, len(back), found.here
 
-    def _improvement(self, view: View) -> tuple[float, float]:
-        """Mean likeness without a shift at the result less that at the start, and its standard error."""
-        likeness = []
-        for v in (self.start, view):
-            try:
-                likeness.append(self._surfaces(v, self.turns[-1].scale, 2).here)
-            except (DegenerateError, _LoopError):
-                likeness.append(np.empty(0))
-        a, b = likeness
+    def _improvement(self, b: FloatArray) -> tuple[float, float]:
+        """Mean of the result's likenesses ``b`` without a shift, one level up, less that of the start's, and its
+        standard error."""
+        try:
+            a = self._surfaces(self.start, self._one_up(), 2).here
+        except (DegenerateError, _LoopError):
+            a = np.empty(0)
         if len(a) == 0 or len(b) == 0:
             return (float("inf") if len(b) > len(a) else float("-inf"), 0.0)
         return float(b.mean() - a.mean()), float(np.sqrt(a.var() / len(a) + b.var() / len(b)))
-
-
-def _frames(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Orthonormal frames (K, 3, 3), in columns, of pairs of unit directions."""
-    middle = a + b
-    middle /= np.linalg.norm(middle, axis=1)[:, None]
-    side = b - a
-    side /= np.linalg.norm(side, axis=1)[:, None]
-    return np.stack([middle, side, np.cross(middle, side)], axis=2)

@@ -1205,7 +1205,6 @@ def backproject_pixels(
     xy: FloatArray,
     *,
     subpixel: npt.NDArray[np.float32] | None = None,
-    beyond: npt.NDArray[np.float32] | None = None,
     radius: float = 4.0,
     extension: float = 0.0,
     max_incidence: float = ...,
@@ -1221,7 +1220,6 @@ def backproject_pixels(
     xy: None = None,
     *,
     subpixel: npt.NDArray[np.float32] | None = None,
-    beyond: npt.NDArray[np.float32] | None = None,
     radius: float = 4.0,
     extension: float = 0.0,
     max_incidence: float = ...,
@@ -1232,15 +1230,13 @@ def backproject_pixels(
     """World points behind pixels, with depths from a synthetic camera image of the same view.
 
     ``depth`` (H, W), float32 or float64, counts where ``measured`` (H, W); ``subpixel`` (H, W, 2) is the measured
-    points' true place from their pixels' centres; ``beyond`` (H, W) has the depths of points that a surface is taken to
-    hide which was not measured in their pixels, 0 or NaN elsewhere. For pixels ``xy`` (N, 2): points (N, 3), depths
-    (N,), origins (N,) of the depth (0 none, 1 measured, 2 interpolated within one surface, 3 extended along one beside
-    the cloud) and sigmas (N, 2) along the ray and, per axis, across it, in metres. Without ``xy``: of all pixels'
-    centres that have a depth, and first their numbers (row * W + column).
+    points' true place from their pixels' centres. For pixels ``xy`` (N, 2): points (N, 3), depths (N,), origins
+    (N,) of the depth (0 none, 1 measured, 2 interpolated within one surface, 3 extended along one beside the cloud)
+    and sigmas (N, 2) along the ray and, per axis, across it, in metres. Without ``xy``: of all pixels' centres that
+    have a depth, and first their numbers (row * W + column).
 
     A surface is a plane through measured points within ``radius`` px; it is extended up to ``extension`` px, and not
     used at an incidence beyond ``max_incidence`` (radians, by default 85 degrees). No depth is made across a depth
-    edge, where the samples around are farther apart than this scan leaves them elsewhere, or where points beyond are
-    as near as the surface's own. ``depth_sigma`` (m), ``pixel_sigma`` (px, of the photo's place) and
-    ``placement_sigma`` (px, of points in their pixels without ``subpixel``) are propagated. Raises InvalidInputError.
+    edge. ``depth_sigma`` (m), ``pixel_sigma`` (px, of the photo's place) and ``placement_sigma`` (px, of points in
+    their pixels without ``subpixel``) are propagated. Raises InvalidInputError.
     """

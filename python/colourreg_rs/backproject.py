@@ -112,7 +112,6 @@ def backproject(
         exact_depths(sci, cloud),
         sci.measured,
         subpixel=np.nan_to_num(sci.subpixel),
-        beyond=_shining_through(sci, cloud),
         radius=options.radius,
         extension=options.extension,
         depth_sigma=options.depth_sigma,
@@ -122,15 +121,6 @@ def backproject(
     pixels = np.stack([pixel % width, pixel // width], 1)
     coloured = PointCloud(xyz, rgb=None if photo is None else _colours(photo, (height, width), pixels))
     return BackProjection(pixels, coloured, depth, origin, sigma)
-
-
-def _shining_through(sci: SCI, cloud: PointCloud) -> npt.NDArray[np.float32]:
-    """(H, W): depths of points in pixels where a surface hides them that was not measured there; 0 elsewhere."""
-    buffer = _core.IndexBuffer(sci.view.core)
-    buffer.add(cloud.xyz)
-    index, inverse, _ = _core.sci_front(buffer, hide=False)
-    hidden = (index >= 0) & ~sci.measured
-    return np.divide(1.0, inverse, out=np.zeros_like(inverse), where=hidden)
 
 
 def _colours(photo: npt.NDArray[Any], shape: tuple[int, int], pixels: npt.NDArray[np.int64]) -> npt.NDArray[np.uint16]:

@@ -22,10 +22,6 @@ use tile::Tile;
 
 /// Side of the tiles that are worked off at once, pixels.
 const TILE: usize = 64;
-/// So many tiles tell how regularly a scan samples its surfaces.
-const TOLD: usize = 256;
-/// Around a pixel to be interpolated the samples may be farther than usually, by this factor.
-const WIDER: f64 = 1.25;
 
 /// Where a depth comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -84,9 +80,6 @@ pub struct DepthImage<'a> {
     pub measured: &'a [bool],
     /// The point's true place from the pixel's centre, x and y; the centre itself if there is none.
     pub subpixel: Option<&'a [[f32; 2]]>,
-    /// Depths of points that a surface in front is taken to hide, though it was not measured in their pixels; NaN or 0
-    /// elsewhere. Where they are as near as the surface's own points there is no surface, but bars or leaves.
-    pub beyond: Option<&'a [f32]>,
 }
 
 /// How depths are found, and how sure their sources are.
@@ -240,10 +233,7 @@ fn check(view: &View, image: &DepthImage, options: &BackprojectOptions) -> Resul
     options.check()?;
     let (w, h) = (view.camera.width as usize, view.camera.height as usize);
     let subpixel = image.subpixel.map_or(w * h, <[_]>::len);
-    let beyond = image.beyond.map_or(w * h, <[_]>::len);
-    for (what, n) in
-        [("depths", image.depth.len()), ("measured", image.measured.len()), ("subpixel", subpixel), ("beyond", beyond)]
-    {
+    for (what, n) in [("depths", image.depth.len()), ("measured", image.measured.len()), ("subpixel", subpixel)] {
         if n != w * h {
             return Err(Error::invalid(format!(
                 "{what} has {n} pixels, but the view's image has {w} × {h}: render it in this view"
@@ -251,29 +241,6 @@ fn check(view: &View, image: &DepthImage, options: &BackprojectOptions) -> Resul
         }
     }
     Ok(())
-}
-
-/// How far the samples all around a pixel may be, in spacings of their surface, before it lies between two bars rather
-/// than between two samples of one surface: a little more than what this scan usually leaves open around its own points.
-/// A regular grid leaves one spacing, points strewn at random nearly three, lines of a road scanner as many as they lie
-/// apart.
-fn widest(view: &View, image: &DepthImage, options: &BackprojectOptions) -> f64 {
-    let columns = (view.camera.width as usize).div_ceil(TILE);
-    let tiles = columns * (view.camera.height as usize).div_ceil(TILE);
-    let chosen: Vec<usize> = (0..tiles).step_by(tiles.div_ceil(TOLD)).collect();
-    let told: Vec<Vec<f64>> = chosen
-        .par_iter()
-        .map_init(Tile::default, |tile, number| {
-            let mut openings = Vec::new();
-            tile.load(view, image, options, number % columns * TILE, number / columns * TILE);
-            tile.openings(view, options, &mut openings);
-            openings
-        })
-        .collect();
-    let mut told: Vec<f64> = told.into_iter().flatten().collect();
-    let middle = told.len() / 2;
-    let usual = if told.is_empty() { 1.0 } else { *told.select_nth_unstable_by(middle, f64::total_cmp).1 };
-    WIDER * usual.max(1.0)
 }
 
 /// The points behind given pixels, each anywhere in the image.
@@ -284,7 +251,6 @@ pub fn backproject_pixels(
     options: &BackprojectOptions,
 ) -> Result<Vec<Backprojected>> {
     check(view, image, options)?;
-    let widest = widest(view, image, options);
     let columns = (view.camera.width as usize).div_ceil(TILE);
     let tile_of = |p: &[f64; 2]| {
         let inside = view.camera.contains(p);
@@ -299,7 +265,7 @@ pub fn backproject_pixels(
         .map_init(Tile::default, |tile, group| {
             let number = group[0].0 as usize;
             tile.load(view, image, options, number % columns * TILE, number / columns * TILE);
-            group.iter().map(|&(_, i)| (i, tile.at(view, &xy[i as usize], widest, options))).collect()
+            group.iter().map(|&(_, i)| (i, tile.at(view, &xy[i as usize], options))).collect()
         })
         .collect();
     let mut out = vec![Backprojected::NONE; xy.len()];
@@ -317,7 +283,6 @@ pub fn backproject_image(
 ) -> Result<(Vec<u32>, Vec<Backprojected>)> {
     check(view, image, options)?;
     let (width, height) = (view.camera.width as usize, view.camera.height as usize);
-    let widest = widest(view, image, options);
     let bands: Vec<usize> = (0..height).step_by(TILE).collect();
     let found: Vec<Vec<(u32, Backprojected)>> = bands
         .par_iter()
@@ -327,7 +292,7 @@ pub fn backproject_image(
                 tile.load(view, image, options, x0, y0);
                 for y in y0..(y0 + TILE).min(height) {
                     for x in x0..(x0 + TILE).min(width) {
-                        let one = tile.at(view, &[x as f64, y as f64], widest, options);
+                        let one = tile.at(view, &[x as f64, y as f64], options);
                         if one.origin != Origin::None {
                             band.push(((y * width + x) as u32, one));
                         }

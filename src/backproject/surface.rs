@@ -44,10 +44,8 @@ pub(super) struct Surface {
     pub value: Vector3<f64>,
     /// Of the inverse depth at the pixel, one sigma.
     pub sigma: f64,
-    /// How far the surface's samples are that lie all around the pixel with hardly any of another among them, pixels.
-    pub ring: Option<f64>,
-    /// Which of the samples lie on it.
-    inside: [bool; MOST],
+    /// Whether samples of the surface lie all around the pixel, and hardly any of another within their ring.
+    pub surrounds: bool,
     /// Whether samples of other surfaces lie where those of this one leave the largest angle open.
     pub bounded: bool,
 }
@@ -141,7 +139,7 @@ pub(super) fn surface(
     let (gap, open) = largest_gap(&held);
     let in_gap = |s: &Sample| (angle(s) - open).rem_euclid(TAU) < gap;
     let bounded = samples.iter().zip(&inside).any(|(s, inside)| !inside && in_gap(s));
-    Some(Surface { value, sigma, ring: ring(&held, samples, &inside), inside, bounded })
+    Some(Surface { value, sigma, surrounds: surrounds(&held, samples, &inside), bounded })
 }
 
 fn angle(s: &Sample) -> f64 {
@@ -166,34 +164,11 @@ fn largest_gap(samples: &[&Sample]) -> (f64, f64) {
     largest
 }
 
-/// How far the surface's nearest samples are that lie all around the pixel without those of another surface among them: a
-/// plane that leans across a depth edge holds a row of samples on either side, and loses the next ones.
-fn ring(held: &[&Sample], samples: &[Sample], inside: &[bool; MOST]) -> Option<f64> {
-    let n = (3..=held.len()).find(|&n| largest_gap(&held[..n]).0 < SURROUNDED)?;
-    let ring = distance(held[n - 1]);
-    let among =
-        |held: bool| samples.iter().zip(inside).filter(|(s, i)| **i == held && distance(s) <= ring + 1.5).count();
-    (5 * among(false) <= among(true)).then_some(ring)
-}
-
-impl Surface {
-    /// From one of the surface's samples to the next one, the median, pixels: along a bar as on a wall, so that the space
-    /// between bars stands out. `samples` are those that the surface was found in.
-    pub fn spacing(&self, samples: &[Sample]) -> f64 {
-        let mut held = [[0.0; 2]; MOST];
-        let mut n = 0;
-        for (s, _) in samples.iter().zip(&self.inside).filter(|(_, inside)| **inside) {
-            held[n] = s.offset;
-            n += 1;
-        }
-        let mut to_next = [f64::INFINITY; MOST];
-        for i in 1..n {
-            for k in 0..i {
-                let d = (held[i][0] - held[k][0]).powi(2) + (held[i][1] - held[k][1]).powi(2);
-                to_next[i] = d.min(to_next[i]);
-                to_next[k] = d.min(to_next[k]);
-            }
-        }
-        to_next[..n].select_nth_unstable_by(n / 2, f64::total_cmp).1.sqrt()
-    }
+/// Whether the surface's nearest samples lie all around the pixel without those of another surface among them: a plane
+/// that leans across a depth edge holds a row of samples on either side, and loses the next ones.
+fn surrounds(held: &[&Sample], samples: &[Sample], inside: &[bool; MOST]) -> bool {
+    let Some(n) = (3..=held.len()).find(|&n| largest_gap(&held[..n]).0 < SURROUNDED) else { return false };
+    let ring = distance(held[n - 1]) + 1.5;
+    let among = |held: bool| samples.iter().zip(inside).filter(|(s, i)| **i == held && distance(s) <= ring).count();
+    5 * among(false) <= among(true)
 }

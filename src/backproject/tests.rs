@@ -59,7 +59,7 @@ fn exact() -> BackprojectOptions {
 }
 
 fn image<'a>(depth: &'a [f64], measured: &'a [bool]) -> DepthImage<'a> {
-    DepthImage { depth: Depths::Double(depth), measured, subpixel: None, beyond: None }
+    DepthImage { depth: Depths::Double(depth), measured, subpixel: None }
 }
 
 /// The largest distance between points and the truth, relative to the distance from the camera.

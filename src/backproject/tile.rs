@@ -9,12 +9,6 @@ use crate::geometry::{Camera, Depth, View, tangents};
 /// What curvature may do to a depth over one pixel, in pixels' sizes on the surface.
 const CURVATURE: f64 = 0.05;
 
-/// The largest incidence of a surface whose slope is believed, radians.
-const GRAZING: f64 = 89.5 * std::f64::consts::PI / 180.0;
-
-/// One in so many pixels is looked at for what a scan leaves open.
-const CHECKED: usize = 29;
-
 /// The largest angle between a pixel's ray and those of its neighbours.
 fn angle_of_a_pixel(camera: &Camera, xy: &[f64; 2]) -> f64 {
     let [x, y] = [xy[0].min(f64::from(camera.width) - 1.0), xy[1].min(f64::from(camera.height) - 1.0)];
@@ -33,11 +27,9 @@ struct Measured {
     inverse: f64,
     /// The point's true place, pixels.
     place: [f64; 2],
-    /// One over the depth of a point that was seen through a gap in front of it; 0 where there is none.
-    beyond: f64,
 }
 
-const EMPTY: Measured = Measured { ray: Vector3::new(0.0, 0.0, 0.0), inverse: 0.0, place: [0.0; 2], beyond: 0.0 };
+const EMPTY: Measured = Measured { ray: Vector3::new(0.0, 0.0, 0.0), inverse: 0.0, place: [0.0; 2] };
 
 /// Measured pixels of a tile and its surroundings.
 #[derive(Default)]
@@ -78,11 +70,6 @@ impl Tile {
         for y in self.y0.max(0)..(self.y0 + self.side).min(height) {
             for x in self.x0.max(0)..(self.x0 + self.side).min(width) {
                 let i = (y * width + x) as usize;
-                let at = ((y - self.y0) * self.side + x - self.x0) as usize;
-                let beyond = image.beyond.map_or(0.0, |b| f64::from(b[i]));
-                if beyond > 0.0 {
-                    self.pixels[at].beyond = 1.0 / beyond;
-                }
                 let depth = image.depth.at(i);
                 if !(image.measured[i] && depth.is_finite() && depth > 0.0) {
                     continue;
@@ -90,40 +77,22 @@ impl Tile {
                 let shift = image.subpixel.map_or([0.0; 2], |s| s[i].map(f64::from));
                 let place = [x as f64 + shift[0], y as f64 + shift[1]];
                 if let Some(ray) = direction(&view.camera, &place) {
-                    self.pixels[at] = Measured { ray, inverse: 1.0 / depth, place, beyond: 0.0 };
+                    let at = ((y - self.y0) * self.side + x - self.x0) as usize;
+                    self.pixels[at] = Measured { ray, inverse: 1.0 / depth, place };
                 }
             }
         }
     }
 
-    fn pixel(&self, x: isize, y: isize) -> Option<&Measured> {
+    fn get(&self, x: isize, y: isize) -> Option<&Measured> {
         let (i, j) = (x - self.x0, y - self.y0);
         let inside = (0..self.side).contains(&i) && (0..self.side).contains(&j);
-        inside.then(|| &self.pixels[(j * self.side + i) as usize])
+        let pixel = inside.then(|| &self.pixels[(j * self.side + i) as usize])?;
+        (pixel.inverse > 0.0).then_some(pixel)
     }
 
-    fn get(&self, x: isize, y: isize) -> Option<&Measured> {
-        self.pixel(x, y).filter(|pixel| pixel.inverse > 0.0)
-    }
-
-    /// How far the samples all around some measured pixels are when these are left out, in spacings of their surface: what
-    /// a scan leaves open on one surface.
-    pub fn openings(&self, view: &View, options: &BackprojectOptions, out: &mut Vec<f64>) {
-        let margin = (self.side - TILE as isize) / 2;
-        for at in (0..(TILE * TILE) as isize).step_by(CHECKED) {
-            let (x, y) = (self.x0 + margin + at % TILE as isize, self.y0 + margin + at / TILE as isize);
-            let Some(own) = self.get(x, y) else { continue };
-            let basis = Basis::new(view.camera.depth_kind(), own.ray, self.pixel);
-            let mut samples = self.samples(&basis, &own.place, (x, y), options.radius);
-            // The pixel itself is the nearest.
-            samples.remove(0);
-            let found = self.surface(&basis, &samples, options.max_incidence, options);
-            out.extend(found.and_then(|s| s.ring.map(|ring| ring / s.spacing(&samples))));
-        }
-    }
-
-    /// The point behind a place in the tile. `widest`: the samples all around may be as far, in spacings of their surface.
-    pub fn at(&self, view: &View, xy: &[f64; 2], widest: f64, options: &BackprojectOptions) -> Backprojected {
+    /// The point behind a place in the tile.
+    pub fn at(&self, view: &View, xy: &[f64; 2], options: &BackprojectOptions) -> Backprojected {
         let Some(ray) = direction(&view.camera, xy) else { return Backprojected::NONE };
         let (x, y) = ((xy[0] + 0.5).floor() as isize, (xy[1] + 0.5).floor() as isize);
         let basis = Basis::new(view.camera.depth_kind(), ray, self.pixel);
@@ -137,14 +106,8 @@ impl Tile {
         let beside = first > 0.5 * options.radius;
         let about = if beside { (x + i, y + j) } else { (x, y) };
         let samples = self.samples(&basis, xy, about, options.radius);
-        let Some(found) = self.surface(&basis, &samples, options.max_incidence, options) else {
-            return Backprojected::NONE;
-        };
-        let origin = if let Some(ring) = found.ring {
-            let open = ring > widest * found.spacing(&samples);
-            if open || self.seen_through((x, y), xy, &samples[0], found.value.x, options) {
-                return Backprojected::NONE;
-            }
+        let Some(found) = self.surface(&basis, &samples, options) else { return Backprojected::NONE };
+        let origin = if found.surrounds {
             Origin::Interpolated
         } else if !found.bounded && first <= options.extension && !self.another_beyond(&basis, &found, (x, y), options)
         {
@@ -168,7 +131,7 @@ impl Tile {
         let distance = shift[0].hypot(shift[1]);
         let (cx, cy) = ((xy[0] + 0.5).floor() as isize, (xy[1] + 0.5).floor() as isize);
         let samples = self.samples(basis, &own.place, (cx, cy), options.radius.min(2.5));
-        let found = self.surface(basis, &samples, options.max_incidence, options);
+        let found = self.surface(basis, &samples, options);
         let noise = options.depth_sigma * own.inverse * own.inverse;
         let unknown = if self.has_places { 0.0 } else { options.placement_sigma };
         match found {
@@ -181,10 +144,8 @@ impl Tile {
                 basis.point(view, Origin::Measured, inverse, noise.hypot(moved), slope, options)
             }
             None => {
-                // At grazing incidence a plane may stand across a depth edge: it does not carry the point, but its slope
-                // says how far off the point may be. Where there is none, 60 degrees are taken for what it may do.
-                let grazing = self.surface(basis, &samples, GRAZING, options);
-                let slope = grazing.map_or(std::f64::consts::FRAC_PI_3, |found| found.slope(basis));
+                // Nothing is known of the slope: 60 degrees are taken for what it may do.
+                let slope = std::f64::consts::FRAC_PI_3;
                 let moved = slope.tan() * basis.pixel * distance.hypot(unknown) * own.inverse;
                 basis.point(view, Origin::Measured, own.inverse, noise.hypot(moved), slope, options)
             }
@@ -207,37 +168,12 @@ impl Tile {
         samples
     }
 
-    fn surface(
-        &self,
-        basis: &Basis,
-        samples: &[Sample],
-        max_incidence: f64,
-        options: &BackprojectOptions,
-    ) -> Option<Surface> {
+    fn surface(&self, basis: &Basis, samples: &[Sample], options: &BackprojectOptions) -> Option<Surface> {
         let inverse = samples.first()?.inverse;
         let tolerance =
             Tolerance { sigma: options.depth_sigma * inverse, systematic: self.rounding + CURVATURE * basis.pixel };
-        let limit = max_incidence.cos();
+        let limit = options.max_incidence.cos();
         surface(samples, options.radius, &tolerance, |value| basis.cosine(value) >= limit)
-    }
-
-    /// Whether a point behind the surface was measured as near to the pixel as the surface's own nearest sample: the scanner
-    /// looked between its bars.
-    fn seen_through(
-        &self,
-        (x, y): (isize, isize),
-        xy: &[f64; 2],
-        nearest: &Sample,
-        inverse: f64,
-        options: &BackprojectOptions,
-    ) -> bool {
-        let limit = nearest.offset[0].hypot(nearest.offset[1]);
-        let behind = inverse * (1.0 - 4.0 * options.depth_sigma * inverse - 20.0 * CURVATURE * self.pixel);
-        self.around.iter().take_while(|(d, ..)| *d <= limit + 1.0).any(|(_, i, j)| {
-            let beyond = self.pixel(x + i, y + j).map_or(0.0, |p| p.beyond);
-            let aside = [(x + i) as f64 - xy[0], (y + j) as f64 - xy[1]];
-            beyond > 0.0 && beyond < behind && aside[0].hypot(aside[1]) <= limit
-        })
     }
 
     /// Whether something else was measured on the other side of an extended pixel, as near as the surface's own points.

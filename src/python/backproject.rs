@@ -15,7 +15,6 @@ struct Images<'py> {
     depth: Depth<'py>,
     measured: Input<'py, bool>,
     subpixel: Option<Input<'py, f32>>,
-    beyond: Option<Input<'py, f32>>,
 }
 
 enum Depth<'py> {
@@ -29,7 +28,6 @@ impl<'py> Images<'py> {
         depth: &Bound<'py, PyAny>,
         measured: &Bound<'py, PyAny>,
         subpixel: Option<&Bound<'py, PyAny>>,
-        beyond: Option<&Bound<'py, PyAny>>,
     ) -> PyResult<Self> {
         let (h, w) = (Some(view.0.camera.height as usize), Some(view.0.camera.width as usize));
         Ok(Self {
@@ -40,7 +38,6 @@ impl<'py> Images<'py> {
             },
             measured: Input::new(measured, "measured", &[h, w])?,
             subpixel: subpixel.map(|s| Input::new(s, "subpixel", &[h, w, Some(2)])).transpose()?,
-            beyond: beyond.map(|b| Input::new(b, "beyond", &[h, w])).transpose()?,
         })
     }
 
@@ -52,7 +49,6 @@ impl<'py> Images<'py> {
             },
             measured: self.measured.values()?,
             subpixel: self.subpixel.as_ref().map(|s| s.rows::<2>()).transpose()?,
-            beyond: self.beyond.as_ref().map(|b| b.values()).transpose()?,
         })
     }
 }
@@ -102,7 +98,7 @@ fn invert_dlt<'py>(
 
 #[pyfunction]
 #[pyo3(signature = (
-    view, depth, measured, xy=None, *, subpixel=None, beyond=None, radius=4.0, extension=0.0, max_incidence=1.4835298641951802,
+    view, depth, measured, xy=None, *, subpixel=None, radius=4.0, extension=0.0, max_incidence=1.4835298641951802,
     depth_sigma=0.003, pixel_sigma=0.5, placement_sigma=0.2886751345948129
 ))]
 #[allow(clippy::too_many_arguments, reason = "Python's keywords are Rust's options")]
@@ -113,7 +109,6 @@ fn backproject_pixels<'py>(
     measured: &Bound<'py, PyAny>,
     xy: Option<&Bound<'py, PyAny>>,
     subpixel: Option<&Bound<'py, PyAny>>,
-    beyond: Option<&Bound<'py, PyAny>>,
     radius: f64,
     extension: f64,
     max_incidence: f64,
@@ -122,7 +117,7 @@ fn backproject_pixels<'py>(
     placement_sigma: f64,
 ) -> PyResult<Bound<'py, PyAny>> {
     let options = BackprojectOptions { radius, extension, max_incidence, depth_sigma, pixel_sigma, placement_sigma };
-    let images = Images::new(view, depth, measured, subpixel, beyond)?;
+    let images = Images::new(view, depth, measured, subpixel)?;
     let image = images.image()?;
     match xy {
         Some(xy) => {

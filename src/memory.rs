@@ -17,6 +17,10 @@ unsafe impl Zeroed for AtomicU32 {}
 // SAFETY: all bits zero is the number 0.
 unsafe impl Zeroed for AtomicU64 {}
 // SAFETY: all bits zero is the number 0.
+unsafe impl Zeroed for u8 {}
+// SAFETY: all bits zero is the number 0.
+unsafe impl Zeroed for u16 {}
+// SAFETY: all bits zero is the number 0.
 unsafe impl Zeroed for f32 {}
 // SAFETY: all bits zero is the number 0.
 unsafe impl Zeroed for f64 {}

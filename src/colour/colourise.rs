@@ -2,6 +2,8 @@
 
 use rayon::prelude::*;
 
+#[cfg(target_arch = "x86_64")]
+use super::bilinear;
 use super::blending::{Blend, Sample};
 use super::sampling::{Interpolation, Photo, rounded};
 use super::visibility::{Sight, VisibilityMap};
@@ -119,6 +121,10 @@ impl<'a> Colourist<'a> {
         self.maps[view].look(points, sight);
         #[cfg(target_arch = "x86_64")]
         if std::arch::is_x86_feature_detected!("avx2") {
+            if let Some((values, size)) = self.photos[view].simple(self.interpolation) {
+                // SAFETY: the processor has the feature, and a photo's pixels can be counted in an i32.
+                return unsafe { self.take_bilinear(view, values, size, sight, rgb, source) };
+            }
             // SAFETY: the processor has the feature.
             return unsafe { self.take_from_one_avx2(view, sight, rgb, source) };
         }
@@ -129,6 +135,38 @@ impl<'a> Colourist<'a> {
     #[target_feature(enable = "avx2")]
     unsafe fn take_from_one_avx2(&self, view: usize, sight: &Sight, rgb: &mut [[u16; 3]], source: &mut [u16]) {
         self.take_from_one(view, sight, rgb, source);
+    }
+
+    /// The usual case: bilinear from 8 bits.
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    unsafe fn take_bilinear(
+        &self,
+        view: usize,
+        values: &[[u8; 3]],
+        size: [usize; 2],
+        sight: &Sight,
+        rgb: &mut [[u16; 3]],
+        source: &mut [u16],
+    ) {
+        let gains = self.gains.as_ref().map(|gains| gains[view]);
+        let count = rgb.len();
+        let number = view as u16 + 1;
+        let mut last = Vec::new();
+        let seen = |i: usize| i < count && sight.cell(i).is_some();
+        let put = |i: usize, colour| {
+            rgb[i] = match &gains {
+                None => bilinear::rounded(colour),
+                gains => rounded(amplified(bilinear::numbers(colour), gains.as_ref())),
+            };
+            source[i] = number;
+        };
+        // SAFETY: the caller's.
+        unsafe { bilinear::each(values, size, sight.positions(), seen, put, |i| last.push(i)) };
+        for i in last {
+            rgb[i] = rounded(self.sample(view, sight.xy(i)));
+            source[i] = number;
+        }
     }
 
     #[inline(always)]

@@ -1,5 +1,6 @@
 //! Colours for points from photos: which photos see a point, what they show there, and what to make of several.
 
+mod bilinear;
 mod blending;
 mod colourise;
 mod exposure;

@@ -102,6 +102,17 @@ impl<'a> Photo<'a> {
         self.height
     }
 
+    /// The pixels, width and height where the photo has 8 bits and two sides, and is to be read bilinearly.
+    #[cfg(target_arch = "x86_64")]
+    pub(super) fn simple(&self, interpolation: Interpolation) -> Option<(&'a [[u8; 3]], [usize; 2])> {
+        match (self.pixels, interpolation) {
+            (Pixels::U8(values), Interpolation::Bilinear) if !self.wraps && values.len() <= i32::MAX as usize / 3 => {
+                Some((values, [self.width, self.height]))
+            }
+            _ => None,
+        }
+    }
+
     /// Calls `put(i, colour)` for the positions of a block that `at` knows, colours as [`Photo::sample`] gives them: one
     /// loop for each kind of photo, which has to ask for nothing on the way.
     #[inline(always)]

@@ -162,13 +162,16 @@ impl VisibilityMap {
         let beside = if right < 0.5 { cell - 1 } else { cell + 1 };
         let above = if down < 0.5 { cell - stride } else { cell + stride };
         let across = above + beside - cell;
+        let limits = [limit[cell], limit[beside], limit[above], limit[across]];
+        // Most points lie before all four, and ask for no more.
+        let hides = limits.map(|limit| inverse < limit);
+        if hides == [false; 4] {
+            return false;
+        }
         let (a, b) = ((right - 0.5).abs(), (down - 0.5).abs());
-        let weight = |cell: usize, weight: f32| if inverse < limit[cell] { weight } else { 0.0 };
-        weight(cell, (1.0 - a) * (1.0 - b))
-            + weight(beside, a * (1.0 - b))
-            + weight(above, (1.0 - a) * b)
-            + weight(across, a * b)
-            > COVERED
+        let weights = [(1.0 - a) * (1.0 - b), a * (1.0 - b), (1.0 - a) * b, a * b];
+        let covered = |k: usize| if hides[k] { weights[k] } else { 0.0 };
+        covered(0) + covered(1) + covered(2) + covered(3) > COVERED
     }
 
     #[cold]
@@ -288,6 +291,13 @@ impl Sight {
     #[inline(always)]
     pub fn cell(&self, i: usize) -> Option<usize> {
         self.located.get(i).map(|(cell, _)| cell)
+    }
+
+    /// Where in the photo the points lie, right and down.
+    #[cfg(target_arch = "x86_64")]
+    #[inline(always)]
+    pub fn positions(&self) -> [&[f64; LANES]; 2] {
+        [&self.block.x, &self.block.y]
     }
 
     /// Where in the photo a point lies.

@@ -8,6 +8,7 @@ use super::arrays::{Input, Output, owned, owned_rows, points3};
 use super::geometry::PyView;
 use crate::colour::{Blend, Colourist, Colours, Exposure, Interpolation, Photo, Pixels, VisibilityMap};
 use crate::error::Error;
+use crate::memory::zeros;
 use crate::render::LocalPlanes;
 
 #[pyclass(frozen, name = "VisibilityMap", module = "colourreg_rs._core")]
@@ -149,7 +150,8 @@ fn colour_points<'py>(
         }
         (None, None) => {
             let (rgb, source) = py.detach(|| {
-                let (mut rgb, mut source) = (vec![[0; 3]; points.len()], vec![0; points.len()]);
+                let n = points.len();
+                let (mut rgb, mut source) = (zeros(n, "colours")?, zeros(n, "the sources of colours")?);
                 colourist.colour(points, normals, Colours { rgb: &mut rgb, source: &mut source })?;
                 Ok::<_, Error>((rgb, source))
             })?;

@@ -5,22 +5,24 @@
 //! the local plane (the inverse depth of a plane is an affine function of the undistorted pixel position), the local
 //! spacing, and how far the sample covers the picture in each direction: to the neighbour where there is one, half a
 //! spacing where the surface ends. In that footprint the plane, not the sample's own depth, is what hides: a surface
-//! seen at a grazing angle neither hides itself nor lets anything shine through, and an edge does not bleed.
+//! seen at a grazing angle neither hides itself nor lets anything shine through, and an edge does not bleed. Where
+//! all samples of a place lie on one plane anyway, one for all of them does ([`super::flat`]), in a fraction of the time.
 //!
 //! Everything here is a function of the merged buffer: chunks, their order and threads cannot be seen in it.
 
 use std::ops::Range;
-use std::sync::Mutex;
+use std::sync::{Mutex, PoisonError};
 
 use rayon::prelude::*;
 
 use super::extremes::{larger, smaller};
+use super::flat::Flat;
 use super::links::{LANES, Links, Surroundings, filled};
 use super::marks::{Canvas, MAX_REACH, Marks, Rule};
 use super::planes::{PLACE, depth_noise};
 use super::pyramid::Pyramid;
 use super::sample::Sample;
-use super::zbuffer::{DepthBuffer, Grid};
+use super::zbuffer::{DepthBuffer, Grid, PAD};
 use crate::error::{Error, Result};
 use crate::geometry::View;
 use crate::memory::zeros;
@@ -109,39 +111,47 @@ impl Surfaces {
         grid.wrap(&mut samples);
         let pixel_angle = pixel_angle(view);
         let ratios = [footprint.gap_ratio, footprint.row_ratio];
-        let surroundings = Surroundings::new(grid, &samples, footprint.steepest, pixel_angle, ratios);
+        let (surroundings, wide_noise) = rayon::join(
+            || Surroundings::new(grid, &samples, footprint.steepest, pixel_angle, ratios),
+            || depth_noise(view, grid, &samples, place),
+        );
         let Footprint { tolerance, inner, .. } = *footprint;
-        let wide_noise = depth_noise(view, grid, &samples, place);
         let rule = Rule { tolerance, inner, pixel_angle, noise: surroundings.noise, wide_noise };
         let mut limit = zeros(grid.len(), "the surfaces of a depth buffer")?;
-        let first = in_bands(&grid, &mut limit, |_, rows, canvas| FirstLook::over(&surroundings, &rule, rows, canvas));
-        let mut spacing = vec![0; grid.first_row() * grid.stride()];
-        let mut open = Vec::new();
-        for band in first {
-            spacing.extend(band.spacing);
-            open.push(band.open);
-        }
-        let mut pyramid = Pyramid::new(&grid);
+        let mut spacing: Vec<u8> = zeros(grid.len(), "the spacing of points")?;
+        // Each band fills its own part.
+        let parts: Vec<_> =
+            spacing[grid.first_row() * grid.stride()..].chunks_mut(BAND * grid.stride()).map(Mutex::new).collect();
+        let mut open = in_bands(&grid, &mut limit, |band, rows, canvas| {
+            let mut part = parts[band].lock().unwrap_or_else(PoisonError::into_inner);
+            FirstLook { spacing: &mut part, open: Vec::new() }.over(&surroundings, &rule, rows, canvas)
+        });
+        drop(parts);
         let mut reach = NEARBY;
+        let cells = open.iter().flatten().map(|links| links.cell);
+        let mut pyramid = Pyramid::new(&grid, cells, footprint.max_gap);
         while reach < footprint.max_gap {
-            open.iter_mut().for_each(|band| band.retain(|links| surroundings.may_find_more(links, reach)));
+            open.par_iter_mut().for_each(|band| band.retain(|links| surroundings.may_find_more(links, reach)));
             if open.iter().all(Vec::is_empty) {
                 break;
             }
             pyramid.coarsen(&samples);
             reach *= 2.0;
             let pending: Vec<_> = open.into_iter().map(Mutex::new).collect();
-            open = in_bands(&grid, &mut limit, |band, _, canvas| {
+            let looked = in_bands(&grid, &mut limit, |band, _, canvas| {
                 let mut list = pending[band].lock().map(|mut list| std::mem::take(&mut *list)).unwrap_or_default();
                 for links in &mut list {
                     if let Some(patch) = surroundings.farther(links, &pyramid, &spacing, footprint.max_gap) {
                         canvas.draw(&grid, grid.row_and_column(links.cell), &rule.mark(&patch));
                     }
                 }
-                list
+                let codes: Vec<u8> = list.iter().map(|links| surroundings.spacing_code(links)).collect();
+                (list, codes)
             });
-            for links in open.iter().flatten() {
-                spacing[links.cell as usize] = surroundings.spacing_code(links);
+            open = Vec::with_capacity(looked.len());
+            for (list, codes) in looked {
+                list.iter().zip(codes).for_each(|(links, code)| spacing[links.cell as usize] = code);
+                open.push(list);
             }
         }
         close(&grid, &mut limit);
@@ -150,38 +160,51 @@ impl Surfaces {
 }
 
 /// What a band's samples found in the nearest cells.
-struct FirstLook {
+struct FirstLook<'a> {
     /// The samples' spacing in all cells of the band.
-    spacing: Vec<u8>,
+    spacing: &'a mut [u8],
     /// The samples that may have neighbours farther away.
     open: Vec<Links>,
 }
 
-impl FirstLook {
-    fn over(s: &Surroundings<'_>, rule: &Rule, rows: Range<usize>, canvas: &mut Canvas<'_>) -> Self {
+impl FirstLook<'_> {
+    fn over(self, s: &Surroundings<'_>, rule: &Rule, rows: Range<usize>, canvas: &mut Canvas<'_>) -> Vec<Links> {
         #[cfg(target_arch = "x86_64")]
         if std::arch::is_x86_feature_detected!("avx2") {
             // SAFETY: the processor has the feature.
-            return unsafe { Self::over_avx2(s, rule, rows, canvas) };
+            return unsafe { self.over_avx2(s, rule, rows, canvas) };
         }
-        Self::over_here(s, rule, rows, canvas)
+        self.over_here(s, rule, rows, canvas)
     }
 
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2")]
-    unsafe fn over_avx2(s: &Surroundings<'_>, rule: &Rule, rows: Range<usize>, canvas: &mut Canvas<'_>) -> Self {
-        Self::over_here(s, rule, rows, canvas)
+    unsafe fn over_avx2(
+        self,
+        s: &Surroundings<'_>,
+        rule: &Rule,
+        rows: Range<usize>,
+        canvas: &mut Canvas<'_>,
+    ) -> Vec<Links> {
+        self.over_here(s, rule, rows, canvas)
     }
 
     #[inline(always)]
-    fn over_here(s: &Surroundings<'_>, rule: &Rule, rows: Range<usize>, canvas: &mut Canvas<'_>) -> Self {
+    fn over_here(
+        mut self,
+        s: &Surroundings<'_>,
+        rule: &Rule,
+        rows: Range<usize>,
+        canvas: &mut Canvas<'_>,
+    ) -> Vec<Links> {
         let stride = s.grid.stride();
         let start = rows.start * stride;
-        let mut this = Self { spacing: vec![0; rows.len() * stride], open: Vec::new() };
         let mut found = Vec::new();
+        let flat = Flat::over(&s.grid, s.samples, rule, rows.clone(), canvas);
         for y in rows {
             found.clear();
-            s.found(y, &mut found);
+            let codes = &mut self.spacing[y * stride - start + PAD..];
+            s.found_beside(y, flat.row(y), &mut found, codes);
             for cells in found.chunks(LANES) {
                 let all = filled(cells);
                 let nearby = s.nearby(&all);
@@ -196,14 +219,14 @@ impl FirstLook {
                 }
                 for (l, &cell) in cells.iter().enumerate() {
                     canvas.draw(&s.grid, [y, cell as usize - y * stride], &marks.get(l));
-                    this.spacing[cell as usize - start] = spacing[l];
+                    self.spacing[cell as usize - start] = spacing[l];
                     if farthest[l] > NEARBY + 1.0 {
-                        this.open.push(s.links(cell, &nearby, l));
+                        self.open.push(s.links(cell, &nearby, l));
                     }
                 }
             }
         }
-        this
+        self.open
     }
 }
 
@@ -223,13 +246,23 @@ fn close(grid: &Grid, limit: &mut [f32]) {
         .collect();
     limit.par_chunks_mut(CLOSED_ROWS * stride).zip(beside).enumerate().for_each(|(band, (cells, [above, below]))| {
         let first = band * CLOSED_ROWS;
-        let before = above.len() / stride;
-        let copy = [&above, &*cells, &below].concat();
-        for (y, row) in cells.chunks_mut(stride).enumerate() {
+        // What becomes of a row is asked for by two more: three rows are kept as they were, so that all stays in the cache.
+        let mut kept: [Vec<f32>; 3] = std::array::from_fn(|_| vec![0.0; stride]);
+        for (row, old) in above.chunks(stride).enumerate() {
+            kept[(first + row + 3 - above.len() / stride) % 3].copy_from_slice(old);
+        }
+        for y in 0..cells.len() / stride {
+            let (done, next) = cells.split_at_mut((y + 1) * stride);
+            let row = &mut done[y * stride..];
+            kept[(first + y) % 3].copy_from_slice(row);
             // The outermost two rows belong to the rim.
             if (2..rows - 2).contains(&(first + y)) {
-                let old = std::array::from_fn(|k| &copy[(before + y + k - 2) * stride..][..stride]);
-                close_row(&old, row);
+                let after = |k: usize| {
+                    let ahead = next.get(k * stride..(k + 1) * stride);
+                    ahead.unwrap_or_else(|| &below[(k - next.len() / stride) * stride..][..stride])
+                };
+                let before = |k: usize| &kept[(first + y + 3 - k) % 3][..];
+                close_row(&[before(2), before(1), before(0), after(0), after(1)], row);
             }
         }
     });

@@ -8,6 +8,7 @@
 use rayon::prelude::*;
 
 use super::extremes::{larger, smaller};
+use super::flat::BLOCK;
 use super::pyramid::Pyramid;
 use super::sample::Sample;
 use super::zbuffer::{Grid, PAD};
@@ -20,8 +21,10 @@ pub(super) const LANES: usize = 8;
 const TOLERANCE: f32 = 0.001;
 /// The tangent of an incidence that is nothing special.
 const USUAL: f32 = 1.7;
-/// Rows of which one is looked at for the noise.
+/// Of so many rows one is looked at for the noise, but of no more than [`ROWS`] or so.
 const EVERY: usize = 16;
+/// Rows that tell the noise well enough.
+const ROWS: usize = 64;
 /// Offsets in each quadrant.
 const RING: usize = 12;
 
@@ -360,10 +363,32 @@ impl<'a> Surroundings<'a> {
         patch
     }
 
+    /// The cells of a row that hold a sample and do not lie in its flat blocks, appended. The spacing of these, which
+    /// `flat` knows, goes to `spacing`; both begin with the first column that may hold a sample.
+    #[inline(always)]
+    pub fn found_beside(&self, row: usize, flat: &[u8], cells: &mut Vec<u32>, spacing: &mut [u8]) {
+        let columns = self.grid.used_columns();
+        let mut from = columns.start;
+        for (&code, spacing) in flat.iter().zip(spacing.chunks_mut(BLOCK)) {
+            if code == 0 {
+                self.found_in(row, from..from + BLOCK, cells);
+            } else {
+                spacing.fill(code);
+            }
+            from += BLOCK;
+        }
+        self.found_in(row, from..columns.end, cells);
+    }
+
     /// The cells of a row that hold a sample, appended.
     #[inline(always)]
-    pub fn found(&self, row: usize, cells: &mut Vec<u32>) {
-        let (start, columns) = (row * self.grid.stride(), self.grid.used_columns());
+    fn found(&self, row: usize, cells: &mut Vec<u32>) {
+        self.found_in(row, self.grid.used_columns(), cells);
+    }
+
+    #[inline(always)]
+    fn found_in(&self, row: usize, columns: std::ops::Range<usize>, cells: &mut Vec<u32>) {
+        let start = row * self.grid.stride();
         let first = cells.len();
         cells.resize(first + columns.len(), 0);
         let mut n = first;
@@ -455,10 +480,11 @@ impl<'a> Surroundings<'a> {
     }
 
     /// The sigma of a depth in the cloud's unit, from samples against the lines between their neighbours: the median of
-    /// a sixteenth of the rows, so that edges and leaves do not count. 0 where the samples stand too far apart.
+    /// some of the rows, so that edges and leaves do not count. 0 where the samples stand too far apart.
     pub fn depth_noise(&self) -> f32 {
-        let rows: Vec<usize> =
-            (self.grid.first_row()..self.grid.rows() - self.grid.first_row()).step_by(EVERY).collect();
+        let rows = self.grid.first_row()..self.grid.rows() - self.grid.first_row();
+        let every = EVERY.max(rows.len() / ROWS);
+        let rows: Vec<usize> = rows.step_by(every).collect();
         let of_row = |y: usize| {
             let mut off = Vec::new();
             let mut found = Vec::new();

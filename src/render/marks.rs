@@ -51,16 +51,28 @@ pub(super) struct Mark {
 }
 
 impl Rule {
+    /// Sigma of a depth, in the cloud's unit, of a surface with this inverse depth.
+    #[inline(always)]
+    pub fn noise_at(&self, own: f32) -> f32 {
+        larger(self.noise, smaller(self.wide_noise, MOST_WIDE_NOISE / own))
+    }
+
+    /// By how much something has to be behind a surface with this inverse depth and its change by one cell to be hidden.
+    #[inline(always)]
+    pub fn slack(&self, own: f32, [gx, gy]: [f32; 2], misfit: f32) -> f32 {
+        let noise = self.noise_at(own);
+        // Noise moves a point not only along the ray: across it, on a slope, it does as much.
+        let across = 0.5 + smaller(1.5 * noise * own / self.pixel_angle, 2.0);
+        let floor = self.tolerance.unwrap_or(1e-4 + 3.0 * noise * own) + 0.3 * self.pixel_angle;
+        own * floor + 0.25 * misfit + across * (gx.abs() + gy.abs())
+    }
+
     /// What a sample covers.
     #[inline(always)]
     pub fn mark(&self, patch: &Patch) -> Mark {
         let [gx, gy] = patch.gradient();
         let own = patch.own + patch.lift([gx, gy]);
-        let noise = larger(self.noise, smaller(self.wide_noise, MOST_WIDE_NOISE / own));
-        // Noise moves a point not only along the ray: across it, on a slope, it does as much.
-        let across = 0.5 + smaller(1.5 * noise * own / self.pixel_angle, 2.0);
-        let floor = self.tolerance.unwrap_or(1e-4 + 3.0 * noise * own) + 0.3 * self.pixel_angle;
-        let slack = own * floor + 0.25 * patch.misfit() + across * (gx.abs() + gy.abs());
+        let slack = self.slack(own, [gx, gy], patch.misfit());
         let spacing = patch.spacing();
         let spacing = if spacing < f32::INFINITY { spacing } else { 0.0 };
         let mut covered = [0.0_f32; QUADRANTS];

@@ -5,6 +5,7 @@
 mod drawing;
 mod extremes;
 pub mod filling;
+mod flat;
 mod footprint;
 pub mod intensity;
 mod links;

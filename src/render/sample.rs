@@ -19,6 +19,7 @@ const STEPS: f32 = (1 << PLACE) as f32;
 const DROPPED: u32 = 32 - 2 * PLACE - 16;
 
 /// A cell's content.
+#[repr(transparent)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
 pub struct Sample(pub u32);
 

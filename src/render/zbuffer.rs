@@ -294,7 +294,11 @@ impl DepthBuffer {
 
     /// The samples.
     pub fn into_samples(self) -> Vec<Sample> {
-        self.cells.into_iter().map(|cell| Sample(cell.into_inner())).collect()
+        let mut cells = std::mem::ManuallyDrop::new(self.cells);
+        let (start, length, room) = (cells.as_mut_ptr().cast::<Sample>(), cells.len(), cells.capacity());
+        // SAFETY: the vector's own parts, which nobody else frees; both types are a u32 in memory. A walk over a hundred
+        // megabytes would change none of them.
+        unsafe { Vec::from_raw_parts(start, length, room) }
     }
 }
 

@@ -10,6 +10,7 @@
 //!
 //! Source: Hartley and Zisserman, Multiple View Geometry, 6.2.2; the paper, 3.1.
 
+mod opening;
 mod surface;
 mod tile;
 
@@ -22,6 +23,11 @@ use tile::Tile;
 
 /// Side of the tiles that are worked off at once, pixels.
 const TILE: usize = 64;
+/// So many tiles tell how regularly a scan samples its surfaces.
+const TOLD: usize = 64;
+/// An opening between samples may be wider than those of the scan usually are by this factor, and by twice the one from
+/// their lower quartile to their median.
+const WIDER: f64 = 1.3;
 
 /// Where a depth comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -243,6 +249,30 @@ fn check(view: &View, image: &DepthImage, options: &BackprojectOptions) -> Resul
     Ok(())
 }
 
+/// How wide an opening between the samples of a surface may be, in their spacings, before something else is seen through
+/// it: the scan's own openings tell. Those of a regular grid are all the same, so that one missing row of samples stands
+/// out; points strewn at random leave far wider ones beside narrow ones. The lower half of them tells how far they spread,
+/// as the space between bars and leaves is in the upper one.
+fn widest(view: &View, image: &DepthImage, options: &BackprojectOptions) -> f64 {
+    let columns = (view.camera.width as usize).div_ceil(TILE);
+    let tiles = columns * (view.camera.height as usize).div_ceil(TILE);
+    let chosen: Vec<usize> = (0..tiles).step_by(tiles.div_ceil(TOLD)).collect();
+    let told: Vec<Vec<f64>> = chosen
+        .par_iter()
+        .map_init(Tile::default, |tile, number| {
+            tile.load(view, image, options, number % columns * TILE, number / columns * TILE);
+            tile.openings(view, options)
+        })
+        .collect();
+    let mut told: Vec<f64> = told.into_iter().flatten().collect();
+    if told.is_empty() {
+        return f64::INFINITY;
+    }
+    told.sort_unstable_by(f64::total_cmp);
+    let (lower, middle) = (told[told.len() / 4], told[told.len() / 2]);
+    WIDER * middle * (middle / lower).powi(2)
+}
+
 /// The points behind given pixels, each anywhere in the image.
 pub fn backproject_pixels(
     view: &View,
@@ -251,6 +281,7 @@ pub fn backproject_pixels(
     options: &BackprojectOptions,
 ) -> Result<Vec<Backprojected>> {
     check(view, image, options)?;
+    let widest = widest(view, image, options);
     let columns = (view.camera.width as usize).div_ceil(TILE);
     let tile_of = |p: &[f64; 2]| {
         let inside = view.camera.contains(p);
@@ -265,7 +296,7 @@ pub fn backproject_pixels(
         .map_init(Tile::default, |tile, group| {
             let number = group[0].0 as usize;
             tile.load(view, image, options, number % columns * TILE, number / columns * TILE);
-            group.iter().map(|&(_, i)| (i, tile.at(view, &xy[i as usize], options))).collect()
+            group.iter().map(|&(_, i)| (i, tile.at(view, &xy[i as usize], widest, options))).collect()
         })
         .collect();
     let mut out = vec![Backprojected::NONE; xy.len()];
@@ -283,6 +314,7 @@ pub fn backproject_image(
 ) -> Result<(Vec<u32>, Vec<Backprojected>)> {
     check(view, image, options)?;
     let (width, height) = (view.camera.width as usize, view.camera.height as usize);
+    let widest = widest(view, image, options);
     let bands: Vec<usize> = (0..height).step_by(TILE).collect();
     let found: Vec<Vec<(u32, Backprojected)>> = bands
         .par_iter()
@@ -292,7 +324,7 @@ pub fn backproject_image(
                 tile.load(view, image, options, x0, y0);
                 for y in y0..(y0 + TILE).min(height) {
                     for x in x0..(x0 + TILE).min(width) {
-                        let one = tile.at(view, &[x as f64, y as f64], options);
+                        let one = tile.at(view, &[x as f64, y as f64], widest, options);
                         if one.origin != Origin::None {
                             band.push(((y * width + x) as u32, one));
                         }

@@ -9,6 +9,12 @@ use crate::geometry::{Camera, Depth, View, tangents};
 /// What curvature may do to a depth over one pixel, in pixels' sizes on the surface.
 const CURVATURE: f64 = 0.05;
 
+/// The largest incidence of a surface whose slope is believed, radians.
+const GRAZING: f64 = 89.5 * std::f64::consts::PI / 180.0;
+
+/// One in so many pixels is looked at for how wide openings a scan leaves.
+const CHECKED: usize = 29;
+
 /// The largest angle between a pixel's ray and those of its neighbours.
 fn angle_of_a_pixel(camera: &Camera, xy: &[f64; 2]) -> f64 {
     let [x, y] = [xy[0].min(f64::from(camera.width) - 1.0), xy[1].min(f64::from(camera.height) - 1.0)];
@@ -91,8 +97,23 @@ impl Tile {
         (pixel.inverse > 0.0).then_some(pixel)
     }
 
-    /// The point behind a place in the tile.
-    pub fn at(&self, view: &View, xy: &[f64; 2], options: &BackprojectOptions) -> Backprojected {
+    /// How wide the scan's openings are, in spacings of their surfaces: at some corners of pixels, in their own as well as in
+    /// between, so that those few between bars in a dense scan are not alone.
+    pub fn openings(&self, view: &View, options: &BackprojectOptions) -> Vec<f64> {
+        let margin = (self.side - TILE as isize) / 2;
+        let opening = |at: usize| {
+            let (x, y) = (self.x0 + margin + (at % TILE) as isize, self.y0 + margin + (at / TILE) as isize);
+            let xy = [x as f64 + 0.5, y as f64 + 0.5];
+            let basis = Basis::new(view.camera.depth_kind(), direction(&view.camera, &xy)?, self.pixel);
+            let samples = self.samples(&basis, &xy, (x, y), options.radius);
+            let found = self.surface(&basis, &samples, options.max_incidence, options)?;
+            found.surrounds.then(|| found.opening(&samples))
+        };
+        (0..TILE * TILE).step_by(CHECKED).filter_map(opening).collect()
+    }
+
+    /// The point behind a place in the tile. Openings between samples may be as wide as `widest`, in their spacings.
+    pub fn at(&self, view: &View, xy: &[f64; 2], widest: f64, options: &BackprojectOptions) -> Backprojected {
         let Some(ray) = direction(&view.camera, xy) else { return Backprojected::NONE };
         let (x, y) = ((xy[0] + 0.5).floor() as isize, (xy[1] + 0.5).floor() as isize);
         let basis = Basis::new(view.camera.depth_kind(), ray, self.pixel);
@@ -106,8 +127,13 @@ impl Tile {
         let beside = first > 0.5 * options.radius;
         let about = if beside { (x + i, y + j) } else { (x, y) };
         let samples = self.samples(&basis, xy, about, options.radius);
-        let Some(found) = self.surface(&basis, &samples, options) else { return Backprojected::NONE };
+        let Some(found) = self.surface(&basis, &samples, options.max_incidence, options) else {
+            return Backprojected::NONE;
+        };
         let origin = if found.surrounds {
+            if found.opening(&samples) > widest {
+                return Backprojected::NONE;
+            }
             Origin::Interpolated
         } else if !found.bounded && first <= options.extension && !self.another_beyond(&basis, &found, (x, y), options)
         {
@@ -131,7 +157,7 @@ impl Tile {
         let distance = shift[0].hypot(shift[1]);
         let (cx, cy) = ((xy[0] + 0.5).floor() as isize, (xy[1] + 0.5).floor() as isize);
         let samples = self.samples(basis, &own.place, (cx, cy), options.radius.min(2.5));
-        let found = self.surface(basis, &samples, options);
+        let found = self.surface(basis, &samples, options.max_incidence, options);
         let noise = options.depth_sigma * own.inverse * own.inverse;
         let unknown = if self.has_places { 0.0 } else { options.placement_sigma };
         match found {
@@ -144,8 +170,10 @@ impl Tile {
                 basis.point(view, Origin::Measured, inverse, noise.hypot(moved), slope, options)
             }
             None => {
-                // Nothing is known of the slope: 60 degrees are taken for what it may do.
-                let slope = std::f64::consts::FRAC_PI_3;
+                // At grazing incidence a plane may stand across a depth edge: it does not carry the point, but its slope
+                // says how far off the point may be. Where there is none, 60 degrees are taken for what it may do.
+                let grazing = self.surface(basis, &samples, GRAZING, options);
+                let slope = grazing.map_or(std::f64::consts::FRAC_PI_3, |found| found.slope(basis));
                 let moved = slope.tan() * basis.pixel * distance.hypot(unknown) * own.inverse;
                 basis.point(view, Origin::Measured, own.inverse, noise.hypot(moved), slope, options)
             }
@@ -168,11 +196,17 @@ impl Tile {
         samples
     }
 
-    fn surface(&self, basis: &Basis, samples: &[Sample], options: &BackprojectOptions) -> Option<Surface> {
+    fn surface(
+        &self,
+        basis: &Basis,
+        samples: &[Sample],
+        max_incidence: f64,
+        options: &BackprojectOptions,
+    ) -> Option<Surface> {
         let inverse = samples.first()?.inverse;
         let tolerance =
             Tolerance { sigma: options.depth_sigma * inverse, systematic: self.rounding + CURVATURE * basis.pixel };
-        let limit = options.max_incidence.cos();
+        let limit = max_incidence.cos();
         surface(samples, options.radius, &tolerance, |value| basis.cosine(value) >= limit)
     }
 

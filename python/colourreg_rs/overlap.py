@@ -73,11 +73,20 @@ class Behind(Generic[T]):
             raise self._failure[0]
         self._waiting.put(item)
 
+    def done(self) -> None:
+        """Waits until all items are worked on; nothing may be handed over afterwards."""
+        if self._thread.is_alive():
+            self._waiting.put(_END)
+            self._thread.join()
+        if self._failure:
+            raise self._failure[0]
+
     def __enter__(self) -> Behind[T]:
         return self
 
     def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
-        self._waiting.put(_END)
-        self._thread.join()
-        if self._failure and error is None:
-            raise self._failure[0]
+        try:
+            self.done()
+        except BaseException:
+            if error is None:
+                raise

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+import sys
 from pathlib import Path
 
 import laspy
@@ -477,6 +478,24 @@ def test_nothing_is_left_of_an_output_that_was_not_finished(data_dir, tmp_path, 
             out.write(next(iter(reader.chunks(100))))
     assert target.read_bytes() == b"what stood here before"
     assert [p.name for p in tmp_path.iterdir()] == ["out.laz"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there is no limit to a file's size there")
+@pytest.mark.parametrize("held", [40_000, 55_000])
+def test_a_disk_that_is_full_ends_in_one_line_and_leaves_nothing(tmp_path, rng, held):
+    import resource
+
+    source, target = tmp_path / "in.las", tmp_path / "out.las"
+    make(source, 7, rng, n=60_000)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (held * 42, before[1]))
+    try:
+        # The records are written behind their making: also the last of them have to be asked for.
+        with pytest.raises(FileError, match="cannot be written"):
+            colour(source, target, rng, size=7_777)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert [p.name for p in tmp_path.iterdir()] == ["in.las"]
 
 
 def test_the_input_is_never_the_output(data_dir, tmp_path):

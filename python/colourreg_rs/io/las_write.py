@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -12,6 +13,7 @@ import numpy.typing as npt
 
 from .. import _core
 from ..errors import FileError, InvalidInputError
+from ..overlap import Behind
 from . import laz
 from .atomic import AtomicFile
 from .clouds import (
@@ -41,6 +43,9 @@ Bytes = npt.NDArray[np.uint8]
 
 #: Bytes of the file copied at a time.
 _COPY = 1 << 24
+
+#: Buffers for records: one is filled, one waits, one is being written.
+_BUFFERS = 3
 
 
 @dataclass(frozen=True)
@@ -111,7 +116,8 @@ class LasOutput(CloudWriter):
         self._splicer: laz.Splicer | None = None
         self._scheme: laz.Scheme | None = None
         self._splicing = False
-        self._buffer = np.empty((0, 0), np.uint8)
+        self._buffers = [np.empty((0, 0), np.uint8)] * _BUFFERS
+        self._disk: Behind[Bytes] | None = None
         self._new_header = b""
 
     def write_records(
@@ -152,18 +158,27 @@ class LasOutput(CloudWriter):
             if self._sink is not None:
                 self._sink.write(patched)
             else:
-                self._file.write(patched.data)
+                # The system takes its time to copy: the next records are put together meanwhile.
+                if self._disk is None:
+                    self._disk = Behind(self._append)
+                self._disk.put(patched)
         self._written += n
 
+    def _append(self, records: Bytes) -> None:
+        self._file.write(records.data)
+        self._out.settle(records.nbytes)
+
     def _patch(self, records: Bytes, columns: list[tuple[int, Bytes]]) -> Bytes:
-        """The new records, in a buffer that the next call uses again."""
+        """The new records, in a buffer that a later call uses again."""
         layout = self._layout
         assert layout is not None
         if not columns and not layout.gap and layout.length == records.shape[1]:
             return records
-        if len(self._buffer) < len(records):
-            self._buffer = np.empty((len(records), layout.length), np.uint8)
-        out = self._buffer[: len(records)]
+        buffer = self._buffers.pop(0)
+        if len(buffer) < len(records):
+            buffer = np.empty((len(records), layout.length), np.uint8)
+        self._buffers.append(buffer)
+        out = buffer[: len(records)]
         _core.patch_records(records, layout.split, layout.gap, columns, out)
         return out
 
@@ -255,6 +270,8 @@ class LasOutput(CloudWriter):
         if self._written != self._header.n_points:
             raise InvalidInputError(f"{self._written:,} of {self._header.n_points:,} points were written")
         try:
+            if self._disk is not None:
+                self._disk.done()
             if self._sink is not None:
                 self._sink.done()
             header = bytearray(self._new_header)
@@ -267,6 +284,9 @@ class LasOutput(CloudWriter):
         self._out.commit()
 
     def discard(self) -> None:
+        if self._disk is not None:
+            with contextlib.suppress(Exception):
+                self._disk.done()
         self._out.discard()
 
 

@@ -32,20 +32,31 @@ pub(super) fn spacing(places: &[Place]) -> f64 {
     to_next[..places.len()].select_nth_unstable_by(places.len() / 2, f64::total_cmp).1.sqrt()
 }
 
+/// The triangle of the places around the origin that no other lies in the circle of: Delaunay's.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Triangle {
+    /// Numbers of the places at its corners.
+    pub corners: [usize; 3],
+    /// Barycentric coordinates of the origin.
+    pub shares: [f64; 3],
+    /// Of the circle.
+    pub radius: f64,
+}
+
 /// A triangle of the places around the origin, which they have to surround: the first one, and those beside the direction
 /// opposite to it.
-fn around(places: &[Place]) -> Option<[Place; 3]> {
-    let (first, others) = places.split_first()?;
-    let (mut left, mut right) = (None::<&Place>, None::<&Place>);
-    for p in others {
+fn around(places: &[Place]) -> Option<[usize; 3]> {
+    let first = places.first()?;
+    let (mut left, mut right) = (None::<usize>, None::<usize>);
+    for (i, p) in places.iter().enumerate() {
         let side = cross(first, p);
         if side > 0.0 || (side == 0.0 && first[0] * p[0] + first[1] * p[1] < 0.0) {
-            left = left.filter(|l| cross(l, p) <= 0.0).or(Some(p));
+            left = left.filter(|l| cross(&places[*l], p) <= 0.0).or(Some(i));
         } else if side < 0.0 {
-            right = right.filter(|r| cross(r, p) >= 0.0).or(Some(p));
+            right = right.filter(|r| cross(&places[*r], p) >= 0.0).or(Some(i));
         }
     }
-    Some([*first, *left?, *right?])
+    Some([0, left?, right?])
 }
 
 /// Centre and squared radius of the circle through three places.
@@ -57,32 +68,33 @@ fn circle([a, b, c]: &[Place; 3]) -> Option<(Place, f64)> {
     radius.is_finite().then_some(([a[0] + centre[0], a[1] + centre[1]], radius))
 }
 
-/// The radius of the circle through three places around the origin that no other lies in: of its Delaunay triangle.
+/// The triangle around the origin, which the places, nearest first, have to surround.
 ///
-/// On the paraboloid z = x² + y² that triangle is the lowest facet at the origin, a linear programme: the place deepest in
-/// the circle takes the corner that the simplex method's ratios name, until none is inside.
-pub(super) fn empty_circle(places: &[Place]) -> Option<f64> {
+/// On the paraboloid z = x² + y² it is the lowest facet at the origin, a linear programme: the place deepest in the circle
+/// takes the corner that the simplex method's ratios name, until none is inside.
+pub(super) fn triangle(places: &[Place]) -> Option<Triangle> {
     let mut corners = around(places)?;
     for _ in 0..EXCHANGES {
-        let (centre, radius) = circle(&corners)?;
-        let (mut deepest, mut nearest) = (&corners[0], radius * (1.0 - 1e-9));
-        for p in places {
+        let at = corners.map(|i| places[i]);
+        let (centre, radius) = circle(&at)?;
+        let (mut deepest, mut nearest) = (corners[0], radius * (1.0 - 1e-9));
+        for (i, p) in places.iter().enumerate() {
             let distance = square(&minus(p, &centre));
             if distance < nearest {
-                (deepest, nearest) = (p, distance);
+                (deepest, nearest) = (i, distance);
             }
         }
+        // Barycentric coordinates in the triangle.
+        let twice = cross(&minus(&at[1], &at[0]), &minus(&at[2], &at[0]));
+        let share = |p: &Place, i: usize| cross(&minus(&at[(i + 1) % 3], p), &minus(&at[(i + 2) % 3], p)) / twice;
+        let shares = [0, 1, 2].map(|i| share(&[0.0; 2], i));
         if nearest >= radius * (1.0 - 1e-9) {
-            return Some(radius.sqrt());
+            return Some(Triangle { corners, shares, radius: radius.sqrt() });
         }
-        // Barycentric coordinates, but for the same factor, of the origin and of the place in the triangle.
-        let share = |p: &Place, i: usize| {
-            cross(&minus(&corners[(i + 1) % 3], p), &minus(&corners[(i + 2) % 3], p))
-                * cross(&minus(&corners[1], &corners[0]), &minus(&corners[2], &corners[0])).signum()
-        };
-        let ratio = |i: &usize| share(&[0.0; 2], *i) / share(deepest, *i);
-        let leaves = (0..3).filter(|i| share(deepest, *i) > 0.0).min_by(|a, b| ratio(a).total_cmp(&ratio(b)))?;
-        corners[leaves] = *deepest;
+        let new = [0, 1, 2].map(|i| share(&places[deepest], i));
+        let leaves =
+            (0..3).filter(|&i| new[i] > 0.0).min_by(|&a, &b| (shares[a] / new[a]).total_cmp(&(shares[b] / new[b])))?;
+        corners[leaves] = deepest;
     }
     None
 }
@@ -124,7 +136,15 @@ mod tests {
             nearest_first.sort_by(|a, b| square(a).total_cmp(&square(b)));
             if let [radius] = empty[..] {
                 found += 1;
-                assert!((empty_circle(&nearest_first).unwrap() - radius).abs() < 1e-9 * radius);
+                let found = triangle(&nearest_first).unwrap();
+                assert!((found.radius - radius).abs() < 1e-9 * radius);
+                let origin: f64 = (0..2)
+                    .map(|axis| {
+                        (0..3).map(|i| found.shares[i] * nearest_first[found.corners[i]][axis]).sum::<f64>().abs()
+                    })
+                    .sum();
+                assert!(origin < 1e-9 && (found.shares.iter().sum::<f64>() - 1.0).abs() < 1e-12);
+                assert!(found.shares.iter().all(|share| *share >= 0.0));
             }
         }
         assert!(found > 190, "{found}");
@@ -138,9 +158,9 @@ mod tests {
             let mut sorted = grid.clone();
             sorted.sort_by(|a, b| square(a).total_cmp(&square(b)));
             assert!((spacing(&sorted[..MOST]) - 1.0).abs() < 1e-12);
-            assert!((empty_circle(&sorted[..MOST]).unwrap() - 0.5f64.sqrt()).abs() < 1e-9);
+            assert!((triangle(&sorted[..MOST]).unwrap().radius - 0.5f64.sqrt()).abs() < 1e-9);
             sorted.retain(|p| (p[0] + x - 1.0).abs() > 0.5);
-            assert!((empty_circle(&sorted).unwrap() - 1.25f64.sqrt()).abs() < 1e-9);
+            assert!((triangle(&sorted).unwrap().radius - 1.25f64.sqrt()).abs() < 1e-9);
         }
     }
 }

@@ -8,7 +8,7 @@ use std::f64::consts::TAU;
 
 use nalgebra::{Matrix3, Vector3};
 
-use super::opening::{empty_circle, spacing};
+use super::opening::{spacing, triangle};
 
 /// A measured depth near a pixel.
 #[derive(Debug, Clone, Copy)]
@@ -32,6 +32,10 @@ const FEWEST: usize = 4;
 
 /// Scatter of a plane's samples beyond their noise is relief if it exceeds that by so many of its own sigmas.
 const RELIEF: f64 = 1.0;
+/// The part of that variance that is passed on to the pixel: some samples stand out, most are near the mean.
+const PASSED_ON: f64 = 0.5;
+/// A sample that is off its neighbours' plane by so many times what samples may be lies across a depth edge.
+const EDGE: f64 = 2.0;
 
 /// How far samples may be from their plane, relative to the inverse depth.
 #[derive(Debug, Clone, Copy)]
@@ -40,6 +44,13 @@ pub(super) struct Tolerance {
     pub sigma: f64,
     /// What curvature and rounding may do, relative.
     pub systematic: f64,
+}
+
+impl Tolerance {
+    /// What noise makes of a plane through few samples allows twice as much as of one sample.
+    fn reach(&self, s: &Sample) -> f64 {
+        4.0 * self.sigma + self.systematic * (1.0 + distance(s))
+    }
 }
 
 /// A plane in the basis at the pixel.
@@ -105,9 +116,7 @@ pub(super) fn surface(
     if samples.len() < FEWEST {
         return None;
     }
-    // What noise makes of a plane through few samples allows twice as much as of one sample.
-    let reach = |s: &Sample| 4.0 * tolerance.sigma + tolerance.systematic * (1.0 + distance(s));
-    let holds = |value: &Vector3<f64>, s: &Sample| miss(value, s) <= reach(s);
+    let holds = |value: &Vector3<f64>, s: &Sample| miss(value, s) <= tolerance.reach(s);
     let mut best: Option<Vector3<f64>> = None;
     let mut most = 0;
     let all = fit(samples.iter(), radius).map(|f| f.0).filter(|v| samples.iter().all(|s| holds(v, s)) && possible(v));
@@ -143,10 +152,10 @@ pub(super) fn surface(
     let freedom = (held.len() - 3) as f64;
     let scatter = squares / freedom;
     let noise = tolerance.sigma.powi(2);
-    // What lies beyond the noise, and beyond what chance makes of it, is relief: neighbours share it, and no mean of them
-    // is nearer to the surface at the pixel than each.
+    // What lies beyond the noise, and beyond what chance makes of it, is relief: neighbours share it, and their mean is
+    // no nearer to the surface at the pixel than each of them.
     let relief = (scatter - noise * (1.0 + RELIEF * (2.0 / freedom).sqrt())).max(0.0);
-    let sigma = (scatter.max(noise) * cofactor + relief).sqrt() * value.x;
+    let sigma = (scatter.max(noise) * cofactor + PASSED_ON * relief).sqrt() * value.x;
 
     let (gap, open) = largest_gap(&held);
     let in_gap = |s: &Sample| (angle(s) - open).rem_euclid(TAU) < gap;
@@ -185,17 +194,42 @@ fn surrounds(held: &[&Sample], samples: &[Sample], inside: &[bool; MOST]) -> boo
     5 * among(false) <= among(true)
 }
 
+/// The triangle of samples that a pixel lies in.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Opening {
+    /// Radius of its circle in the surface's usual spacings. One missing row of a square grid makes 1.12 of 0.71, wherever
+    /// in it the pixel is.
+    pub width: f64,
+    /// Of the inverse depth at the pixel, one sigma: corners that lie on something else, as near as relief, may go on to
+    /// it.
+    pub relief: f64,
+    /// Whether a corner lies across a depth edge.
+    pub edge: bool,
+}
+
 impl Surface {
-    /// The widest place between samples of the surface that the pixel lies in, in their usual spacing: the radius of the
-    /// circle through three of them around the pixel that none lies in, their Delaunay triangle's. One missing row of a
-    /// square grid makes 1.12 of 0.71, wherever in it the pixel is. `samples` are those that the surface was found in.
-    pub fn opening(&self, samples: &[Sample]) -> f64 {
+    /// Between which samples the pixel lies. `samples` are those that the surface was found in.
+    pub fn opening(&self, samples: &[Sample], tolerance: &Tolerance) -> Option<Opening> {
         let mut places = [[0.0; 2]; MOST];
+        let mut held = [[0.0; 2]; MOST];
         let mut n = 0;
-        for (s, _) in samples.iter().zip(&self.inside).filter(|(_, inside)| **inside) {
-            places[n] = s.offset;
-            n += 1;
+        for (i, s) in samples.iter().enumerate() {
+            places[i] = s.offset;
+            if self.inside[i] {
+                held[n] = s.offset;
+                n += 1;
+            }
         }
-        empty_circle(&places[..n]).map_or(f64::INFINITY, |radius| radius / spacing(&places[..n]))
+        let found = triangle(&places[..samples.len()])?;
+        let (mut variance, mut edge) = (0.0, false);
+        for (i, share) in found.corners.iter().zip(&found.shares) {
+            if !self.inside[*i] {
+                let off = miss(&self.value, &samples[*i]);
+                variance += share.max(0.0) * off * off;
+                edge |= off > EDGE * tolerance.reach(&samples[*i]);
+            }
+        }
+        let width = found.radius / spacing(&held[..n]);
+        Some(Opening { width, relief: variance.sqrt() * self.value.x, edge })
     }
 }

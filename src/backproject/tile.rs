@@ -107,7 +107,10 @@ impl Tile {
             let basis = Basis::new(view.camera.depth_kind(), direction(&view.camera, &xy)?, self.pixel);
             let samples = self.samples(&basis, &xy, (x, y), options.radius);
             let found = self.surface(&basis, &samples, options.max_incidence, options)?;
-            found.surrounds.then(|| found.opening(&samples))
+            if !found.surrounds {
+                return None;
+            }
+            found.opening(&samples, &self.tolerance(&basis, &samples, options)).map(|opening| opening.width)
         };
         (0..TILE * TILE).step_by(CHECKED).filter_map(opening).collect()
     }
@@ -127,13 +130,13 @@ impl Tile {
         let beside = first > 0.5 * options.radius;
         let about = if beside { (x + i, y + j) } else { (x, y) };
         let samples = self.samples(&basis, xy, about, options.radius);
-        let Some(found) = self.surface(&basis, &samples, options.max_incidence, options) else {
+        let Some(mut found) = self.surface(&basis, &samples, options.max_incidence, options) else {
             return Backprojected::NONE;
         };
         let origin = if found.surrounds {
-            if found.opening(&samples) > widest {
-                return Backprojected::NONE;
-            }
+            let opening = found.opening(&samples, &self.tolerance(&basis, &samples, options));
+            let Some(opening) = opening.filter(|o| o.width <= widest && !o.edge) else { return Backprojected::NONE };
+            found.sigma = found.sigma.hypot(opening.relief);
             Origin::Interpolated
         } else if !found.bounded && first <= options.extension && !self.another_beyond(&basis, &found, (x, y), options)
         {
@@ -196,6 +199,12 @@ impl Tile {
         samples
     }
 
+    /// How far samples may be from a plane, the first of them being the nearest.
+    fn tolerance(&self, basis: &Basis, samples: &[Sample], options: &BackprojectOptions) -> Tolerance {
+        let inverse = samples.first().map_or(0.0, |s| s.inverse);
+        Tolerance { sigma: options.depth_sigma * inverse, systematic: self.rounding + CURVATURE * basis.pixel }
+    }
+
     fn surface(
         &self,
         basis: &Basis,
@@ -203,10 +212,8 @@ impl Tile {
         max_incidence: f64,
         options: &BackprojectOptions,
     ) -> Option<Surface> {
-        let inverse = samples.first()?.inverse;
-        let tolerance =
-            Tolerance { sigma: options.depth_sigma * inverse, systematic: self.rounding + CURVATURE * basis.pixel };
         let limit = max_incidence.cos();
+        let tolerance = self.tolerance(basis, samples, options);
         surface(samples, options.radius, &tolerance, |value| basis.cosine(value) >= limit)
     }
 

@@ -3,6 +3,8 @@
 
 use std::sync::atomic::{AtomicU32, AtomicU64};
 
+use rayon::prelude::*;
+
 use crate::error::{Error, Result};
 use crate::neighbours::Neighbour;
 use crate::render::Sample;
@@ -63,10 +65,28 @@ pub(crate) fn zeros<T: Zeroed>(n: usize, what: &str) -> Result<Vec<T>> {
     }
 }
 
+/// `n` zeros for `what` that will all be used: their memory is fetched at once and by all processors. Where reading came
+/// first, each page would be found twice.
+pub(crate) fn fetched<T: Zeroed + Send>(n: usize, what: &str) -> Result<Vec<T>> {
+    let mut memory = zeros::<T>(n, what)?;
+    let page = (PAGE / size_of::<T>().max(1)).max(1);
+    memory.par_chunks_mut(SHARE * page).for_each(|part| {
+        for first in part.iter_mut().step_by(page) {
+            // SAFETY: zeros over zeros, which are valid; volatile, as the compiler would see that nothing changes.
+            unsafe { std::ptr::from_mut(first).cast::<u8>().write_volatile(0) };
+        }
+    });
+    Ok(memory)
+}
+
+/// Bytes of a page, at least.
+const PAGE: usize = 4096;
+/// Pages that are fetched by one processor: a large one.
+const SHARE: usize = 512;
+
 /// Asks for large pages for untouched memory. Advice: if it is not taken, nothing is lost.
 #[cfg(target_os = "linux")]
 fn prefer_large_pages(memory: *mut u8, size: usize) {
-    const PAGE: usize = 4096;
     /// Below this there is nothing to win.
     const LARGE: usize = 4 << 20;
     if size >= LARGE {
@@ -88,6 +108,8 @@ mod tests {
         for n in [0, 1, 1000, 3 << 20] {
             let zeros = zeros::<f32>(n, "a test").unwrap();
             assert!(zeros.len() == n && zeros.iter().all(|&v| v == 0.0), "{n}");
+            let fetched = fetched::<[u16; 3]>(n, "a test").unwrap();
+            assert!(fetched.len() == n && fetched.as_flattened().iter().all(|&v| v == 0), "{n}");
         }
         let error = zeros::<AtomicU64>(1 << 55, "a test").unwrap_err().to_string();
         assert!(error.starts_with("there is no memory for a test of "), "{error}");

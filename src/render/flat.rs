@@ -164,16 +164,23 @@ fn plane<const WINDOW: usize>(samples: &[Sample], stride: usize, rule: &Rule) ->
 fn covered<const WINDOW: usize>(rows: &[&[Sample; WINDOW]; WINDOW]) -> bool {
     let mut wide = [0_u32; WINDOW];
     for (wide, row) in wide.iter_mut().zip(rows) {
-        let mut bits = 0_u32;
-        for x in 0..WINDOW {
-            bits |= u32::from(row[x].found()) << x;
-        }
+        let bits = found_bits(row);
         *wide = bits | bits << 1 | bits << 2 | bits >> 1 | bits >> 2;
     }
     let all = (2..WINDOW - 2)
         .fold(u32::MAX, |all, y| all & (wide[y - 2] | wide[y - 1] | wide[y] | wide[y + 1] | wide[y + 2]));
     let inner = ((1_u32 << (WINDOW - 4)) - 1) << 2;
     all & inner == inner
+}
+
+/// Which cells of a row hold a sample, the first in the lowest bit.
+#[inline(always)]
+fn found_bits<const WINDOW: usize>(row: &[Sample; WINDOW]) -> u32 {
+    let mut bits = 0_u32;
+    for (k, block) in row.as_chunks::<BLOCK>().0.iter().enumerate() {
+        bits |= u32::from(!Sample::empty(block)) << (BLOCK * k);
+    }
+    bits
 }
 
 impl Canvas<'_> {

@@ -25,7 +25,7 @@ use super::sample::Sample;
 use super::zbuffer::{DepthBuffer, Grid, PAD};
 use crate::error::{Error, Result};
 use crate::geometry::View;
-use crate::memory::zeros;
+use crate::memory::fetched;
 
 /// How surfaces are told from gaps, and how much in front "in front" is. The defaults were set on simulated scans, where
 /// they lose about two visible points in a hundred and pass one or two hidden ones.
@@ -117,8 +117,8 @@ impl Surfaces {
         );
         let Footprint { tolerance, inner, .. } = *footprint;
         let rule = Rule { tolerance, inner, pixel_angle, noise: surroundings.noise, wide_noise };
-        let mut limit = zeros(grid.len(), "the surfaces of a depth buffer")?;
-        let mut spacing: Vec<u8> = zeros(grid.len(), "the spacing of points")?;
+        let mut limit = fetched(grid.len(), "the surfaces of a depth buffer")?;
+        let mut spacing: Vec<u8> = fetched(grid.len(), "the spacing of points")?;
         // Each band fills its own part.
         let parts: Vec<_> =
             spacing[grid.first_row() * grid.stride()..].chunks_mut(BAND * grid.stride()).map(Mutex::new).collect();

@@ -309,7 +309,7 @@ def register(
     print(result.text())
     _write_json(json_file, result.as_dict())
     if report is not None:  # a view that is not to be trusted needs looking at most
-        _evaluate(result.registration, out, None, cloud, report, None, quiet=True)
+        _evaluate(result.registration, [out], None, cloud, report, None, quiet=True)
     if result.doubts and not force:
         raise FileError(
             photo,
@@ -359,7 +359,10 @@ def colourise(
 
 @app.command()
 def evaluate(
-    registration: Annotated[Path, typer.Argument(metavar="REG.json", help="The registration.")],
+    registrations: Annotated[
+        list[Path],
+        typer.Argument(metavar="REG.json...", help="The registration; several are compared with each other too."),
+    ],
     points: Annotated[
         Path | None, typer.Option(help="More points (CSV); those that took no part are check points.")
     ] = None,
@@ -370,18 +373,17 @@ def evaluate(
     json_file: JsonOption = None,
 ) -> None:
     """How accurate a registration is: in pixels, millimetres and milliradians, with tests and advice."""
-    _refuse_outputs([report, json_file], [points, cloud], [registration])
+    _refuse_outputs([report, json_file], [points, cloud], registrations)
+    from .accuracy.assessment_run import read_registrations
     from .io.points import read_points
-    from .io.registration import read_registration
-    from .photo_sizes import with_photo_sizes
 
-    views = with_photo_sizes(read_registration(registration), registration)
-    _evaluate(views, registration, read_points(points) if points else None, cloud, report, json_file)
+    views, files = read_registrations(registrations)
+    _evaluate(views, files, read_points(points) if points else None, cloud, report, json_file)
 
 
 def _evaluate(
     views: Registration,
-    path: Path,
+    files: Sequence[Path],
     points: Sequence[ControlPoint] | None,
     cloud: Path | None,
     report: Path | None,
@@ -394,14 +396,15 @@ def _evaluate(
 
     with terminal_bars() as progress:
         assessed, photos = assess_registration(
-            views, path, points, cloud, pictures=report is not None, progress=progress
+            views, files, points, cloud, pictures=report is not None, progress=progress
         )
     if not quiet:
         print(text_of(assessed))
     if report is not None:
         from .report import write_report
 
-        write_report(report, assessed, photos, title=path.stem, cloud=cloud.name if cloud else None)
+        title = ", ".join(dict.fromkeys(file.stem for file in files))
+        write_report(report, assessed, photos, title=title, cloud=cloud.name if cloud else None)
         print(f"wrote {report}")
     _write_json(json_file, [a.as_dict() | {"advice": list(advice(a))} for a in assessed])
 

@@ -153,7 +153,7 @@ def _register(folder: Path, photo: SimulatedPhoto) -> Path:
 def _report(folder: Path, registration: Path) -> str:
     """The page that says how good the view is, for people."""
     cloud = folder / "scan.laz"
-    assessed, photos = assess_registration(read_registration(registration), registration, None, cloud, pictures=True)
+    assessed, photos = assess_registration(read_registration(registration), [registration], None, cloud, pictures=True)
     name = registration.name.replace("-registration.json", "-report.html")
     write_report(folder / name, assessed, photos, title=registration.stem, cloud=cloud.name)
     return name

@@ -8,13 +8,16 @@ use statrs::distribution::{ChiSquared, ContinuousCDF};
 
 use super::fit::{apply, chunked};
 use super::schedule::Schedule;
-use super::sorted::Sorted;
-use super::{Metric, Options};
+use super::sorted::{self, Sorted};
+use super::{Metric, Options, Sets};
 use crate::error::{Error, Result};
 use crate::neighbours::{NONE, Neighbour, Neighbours};
 
 /// Among so many nearest points the one with the smallest Mahalanobis distance is looked for.
 const CANDIDATES: usize = 4;
+
+/// Points per task when pairs are gathered.
+const PIECE: usize = 4096;
 
 /// Variance across over variance along a neighbourhood: below the first it is a line, above the second it is none.
 const LINE: [f64; 2] = [0.05, 0.25];
@@ -126,6 +129,30 @@ impl Pairs {
         self.source.len()
     }
 
+    /// Makes pairs of the points that found a partner, in their order.
+    fn gather(&mut self, targets: &[[f64; 2]]) {
+        let Self { source, target, moved, goals, all, found, .. } = self;
+        let paired = |piece: &[Neighbour]| piece.iter().filter(|n| n.found().is_some()).count();
+        let counts: Vec<usize> = found.par_chunks(PIECE).map(paired).collect();
+        let total = counts.iter().sum();
+        source.resize(total, 0);
+        target.resize(total, 0);
+        moved.resize(total, [0.0; 2]);
+        goals.resize(total, [0.0; 2]);
+        let indices = cut(source, &counts).into_par_iter().zip(cut(target, &counts));
+        let places = cut(moved, &counts).into_par_iter().zip(cut(goals, &counts));
+        let pieces = all.par_chunks(PIECE).zip(found.par_chunks(PIECE)).enumerate();
+        pieces.zip(indices.zip(places)).for_each(|((piece, (all, found)), ((source, target), (moved, goals)))| {
+            let mine = all.iter().zip(found).enumerate().filter_map(|(i, (p, n))| Some((i, p, n.found()?)));
+            for (k, (i, p, j)) in mine.enumerate() {
+                source[k] = (piece * PIECE + i) as u32;
+                target[k] = j as u32;
+                moved[k] = *p;
+                goals[k] = targets[j];
+            }
+        });
+    }
+
     /// xx, xy, yy of each pair; empty where all weigh the same.
     pub fn weights(&self) -> &[[f64; 3]] {
         &self.weights
@@ -197,8 +224,8 @@ impl Residuals {
 }
 
 impl<'a> Matcher<'a> {
-    pub fn new(source: Sorted, target: Sorted, options: &'a Options) -> Result<Self> {
-        let index = Neighbours::new(&target.points)?;
+    pub fn new(sets: &Sets, options: &'a Options) -> Result<Self> {
+        let (source, target, index) = sorted::sort(sets, &options.initial)?;
         let gate = ChiSquared::new(2.0).map_err(|e| Error::Internal(format!("χ² distribution: {e}")))?;
         let mut this = Self {
             corners: corners(&source.points),
@@ -264,13 +291,12 @@ impl<'a> Matcher<'a> {
             found.resize(n, Neighbour::NONE);
             held.resize(n, Held::NOTHING);
             let limit2 = schedule.threshold * schedule.threshold;
-            #[allow(clippy::type_complexity, reason = "what zipping gives")]
-            let partner = |(((source, p), n), held): (((&[f64; 2], &mut [f64; 2]), &mut Neighbour), &mut Held)| {
+            let points = self.source.points.par_iter().zip(all.par_iter_mut());
+            let partners = found.par_iter_mut().zip(held.par_iter_mut());
+            points.zip(partners).with_min_len(1024).for_each(|((source, p), (n, held))| {
                 *p = apply(transform, source);
                 *n = held.partner(p, &self.target.points, &self.index, limit2);
-            };
-            let points = self.source.points.par_iter().zip(all.par_iter_mut());
-            points.zip(found.par_iter_mut()).zip(held.par_iter_mut()).with_min_len(1024).for_each(partner);
+            });
         }
         if self.options.mutual {
             self.keep_mutual(all, found)?;
@@ -278,18 +304,7 @@ impl<'a> Matcher<'a> {
         if self.options.keep < 1.0 {
             trim(found, self.options.keep);
         }
-        pairs.source.clear();
-        pairs.target.clear();
-        pairs.moved.clear();
-        pairs.goals.clear();
-        for (i, (p, n)) in pairs.all.iter().zip(&pairs.found).enumerate() {
-            if let Some(j) = n.found() {
-                pairs.source.push(i as u32);
-                pairs.target.push(n.index);
-                pairs.moved.push(*p);
-                pairs.goals.push(self.target.points[j]);
-            }
-        }
+        pairs.gather(&self.target.points);
         if self.shapes.is_some() || self.has_covariances() {
             pairs.weights = self.weights(transform, pairs, schedule.slack);
         }
@@ -398,6 +413,16 @@ impl<'a> Matcher<'a> {
             )
             .collect()
     }
+}
+
+/// Consecutive parts of the given lengths.
+fn cut<'v, T>(mut rest: &'v mut [T], lengths: &[usize]) -> Vec<&'v mut [T]> {
+    let mut part = |&n: &usize| {
+        let (part, after) = std::mem::take(&mut rest).split_at_mut(n);
+        rest = after;
+        part
+    };
+    lengths.iter().map(&mut part).collect()
 }
 
 /// Principal directions of some points.

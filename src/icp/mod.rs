@@ -150,8 +150,7 @@ impl Options {
 /// error, for they determine nothing.
 pub fn run(sets: &Sets, options: &Options) -> Result<Report> {
     options.check()?;
-    let (source, target) = sorted::sort(sets, &options.initial)?;
-    let matcher = Matcher::new(source, target, options)?;
+    let matcher = Matcher::new(sets, options)?;
     let mut transform = options.initial / options.initial[(2, 2)];
     let mut schedule =
         Schedule::new(options, matcher.extent(), matcher.reach(), || matcher.first_distances(&transform))?;

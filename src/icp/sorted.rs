@@ -5,7 +5,7 @@ use nalgebra::Matrix3;
 use super::Sets;
 use super::fit::apply;
 use crate::error::{Error, Result};
-use crate::neighbours::{along_a_curve, refuse_not_finite};
+use crate::neighbours::{Neighbours, along_a_curve, refuse_not_finite};
 
 /// A set and where each of its points came from.
 pub(super) struct Sorted {
@@ -22,8 +22,9 @@ impl Sorted {
     }
 }
 
-/// Source and target, checked; the source is sorted by where it lies under the initial transformation.
-pub(super) fn sort(sets: &Sets, initial: &Matrix3<f64>) -> Result<(Sorted, Sorted)> {
+/// Source and target, checked, and an index of the target's sorted points; the source is sorted by where it lies under
+/// the initial transformation. Both at the same time.
+pub(super) fn sort(sets: &Sets, initial: &Matrix3<f64>) -> Result<(Sorted, Sorted, Neighbours<2>)> {
     for (points, which) in [(sets.source, "source"), (sets.target, "target")] {
         if points.is_empty() {
             return Err(Error::invalid(format!("there is no {which} point")));
@@ -32,12 +33,19 @@ pub(super) fn sort(sets: &Sets, initial: &Matrix3<f64>) -> Result<(Sorted, Sorte
     }
     check_covariances(sets.source_covariance, sets.source.len(), "source")?;
     check_covariances(sets.target_covariance, sets.target.len(), "target")?;
-    let moved: Vec<[f64; 2]> = sets.source.iter().map(|p| apply(initial, p)).collect();
-    refuse_not_finite(&moved, "transformed source point")?;
-    Ok((
-        Sorted::new(sets.source, sets.source_covariance, along_a_curve(&moved)),
-        Sorted::new(sets.target, sets.target_covariance, along_a_curve(sets.target)),
-    ))
+    let source = || {
+        let moved: Vec<[f64; 2]> = sets.source.iter().map(|p| apply(initial, p)).collect();
+        refuse_not_finite(&moved, "transformed source point")?;
+        Ok(Sorted::new(sets.source, sets.source_covariance, along_a_curve(&moved)))
+    };
+    let target = || {
+        let sorted = Sorted::new(sets.target, sets.target_covariance, along_a_curve(sets.target));
+        let index = Neighbours::new(&sorted.points)?;
+        Ok((sorted, index))
+    };
+    let (source, target) = rayon::join(source, target);
+    let (target, index) = target?;
+    Ok((source?, target, index))
 }
 
 fn check_covariances(covariances: Option<&[[[f64; 2]; 2]]>, n: usize, which: &str) -> Result<()> {

@@ -184,3 +184,31 @@ fn a_known_neighbour_changes_nothing_but_the_time() {
         assert_eq!(index.nearest_from(q, known), index.nearest_one(q, f64::INFINITY));
     }
 }
+
+#[test]
+fn far_queries_are_answered_and_nothing_is_nearer_than_the_rest() {
+    // A crowded line in a wide, nearly empty field: the cells are small, and most of the field is far from all points.
+    let mut numbers = Numbers(7);
+    let mut points: Vec<[f64; 2]> = (0..3000).map(|i| [f64::from(i) / 3.0, 500.0 + numbers.next()]).collect();
+    points.extend((0..100).map(|_| [1000.0 * numbers.next(), 1000.0 * numbers.next()]));
+    points.push(points[17]);
+    let index = Neighbours::new(&points).unwrap();
+    assert!(index.grid.is_some());
+    for _ in 0..2000 {
+        let q = [1400.0 * numbers.next() - 200.0, 1400.0 * numbers.next() - 200.0];
+        let all = brute(&points, &q, f64::INFINITY);
+        let limit2 = if numbers.next() < 0.5 { f64::INFINITY } else { 2.0 * numbers.next() * all[0].distance2 };
+        let known = all[..5].iter().find(|n| n.distance2 <= limit2 && numbers.next() < 0.2);
+        let none = Neighbour { index: NONE, distance2: limit2 };
+        let (found, rest2) = index.nearest_and_rest(&q, *known.unwrap_or(&none));
+        let below = |value: f64, bound: f64| value <= bound * (1.0 + 1e-12);
+        if all[0].distance2 <= limit2 {
+            assert!(below(found.distance2, all[0].distance2), "{found:?} {all:?}");
+            assert!(below(rest2, all[1].distance2));
+        } else {
+            assert!(found == Neighbour::NONE && below(rest2, all[0].distance2));
+        }
+        assert!(below(index.nearest_one(&q, f64::INFINITY).distance2, all[0].distance2));
+    }
+    assert!(index.coarse.get().is_some(), "no query was far");
+}

@@ -10,11 +10,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from colourreg_rs import Camera, ControlPoint, PointCloud, Pose, View, _core
+from colourreg_rs import Camera, ControlPoint, PointCloud, Pose, Registration, View, _core
 from colourreg_rs.io.clouds import open_cloud, read_cloud, write_cloud
 from colourreg_rs.io.images import read_photo, write_image
 from colourreg_rs.io.points import read_points, write_points
-from colourreg_rs.io.registration import read_registration, write_camera
+from colourreg_rs.io.registration import read_registration, write_camera, write_registration
 from colourreg_rs.register import RegisterOptions, register_photo
 
 CAMERA = Camera("OPENCV", 600, 400, {"fx": 500.0, "fy": 500.0, "cx": 299.5, "cy": 199.5, "k1": -0.04})
@@ -92,6 +92,24 @@ def test_register_colourise_evaluate(job):
     plain = (source > 0) & (np.abs(xy % 256 - 128) < 100).all(1) & (xy > 0).all(1) & (xy < [599, 399]).all(1)
     assert np.abs(after.rgb[plain, :2] / 256 - xy[plain] % 256).max() < 0.01
     assert (after.rgb[source == 0] == 0).all()
+
+
+def test_several_registrations_are_evaluated_together(job, tmp_path):
+    first, second, elsewhere = tmp_path / "first.json", tmp_path / "second.json", tmp_path / "elsewhere.json"
+    view = View("photo", job / "photo.png", CAMERA, POSE, points=tuple(read_points(job / "points.csv")))
+    write_registration(first, Registration((view,), crs_wkt='LOCAL_CS["here"]'))
+    write_registration(second, Registration((view, replace(view, name="other")), crs_wkt=None))
+    write_registration(elsewhere, Registration((view,), crs_wkt='LOCAL_CS["elsewhere"]'))
+    done = colourreg("evaluate", first, second, "--json", tmp_path / "all.json")
+    assert done.returncode == 0, done.stderr
+    assert [line for line in done.stdout.splitlines() if line.startswith("view ")] == [
+        "view first: photo", "view second: photo", "view other",
+    ]  # fmt: skip
+    assert len(json.loads((tmp_path / "all.json").read_text())) == 3
+    for wrong, what in ((first, "is given twice"), (elsewhere, "another coordinate system")):
+        done = colourreg("evaluate", first, wrong)
+        assert done.returncode == 1 and done.stderr.count("\n") == 1
+        assert what in done.stderr and str(wrong) in done.stderr
 
 
 def test_exchanged_axes_are_refused_however_well_one_wall_fits(job):

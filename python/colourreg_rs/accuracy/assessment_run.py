@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,15 +13,41 @@ import numpy as np
 from ..errors import FileError, InvalidInputError
 from ..evaluate import table
 from ..io.images import read_photo
-from ..model import ControlPoint, Registration
+from ..io.registration import read_registration
+from ..model import ControlPoint, Registration, View
+from ..photo_sizes import with_photo_sizes
 from ..progress import Progress, silent
 from .advice import advice, figure, headline, in_all_units
 from .assessment import CHECK_ALPHA, ViewAssessment, assess, at_depth, next_points_on
 
 
+def read_registrations(paths: Sequence[Path]) -> tuple[Registration, tuple[Path, ...]]:
+    """The views of one or more registrations together, so that photos of one cloud are compared with each other; and
+    the file of each view.
+
+    A name that two files use gets its file's before it. Raises FileError where a file cannot be used, is given twice,
+    or is in another coordinate system than the first.
+    """
+    read = [with_photo_sizes(read_registration(path), path) for path in paths]
+    files = tuple(path for path, registration in zip(paths, read, strict=True) for _ in registration.views)
+    if len(read) == 1:
+        return read[0], files
+    names = Counter(view.name for registration in read for view in registration.views)
+    views: list[View] = []
+    for i, (path, registration) in enumerate(zip(paths, read, strict=True)):
+        if path.resolve() in [earlier.resolve() for earlier in paths[:i]]:
+            raise FileError(path, "is given twice", "name each registration once")
+        if registration.crs_wkt and read[0].crs_wkt and registration.crs_wkt != read[0].crs_wkt:
+            raise FileError(
+                path, f"is in another coordinate system than {paths[0]}", "evaluate registrations of one frame together"
+            )
+        views += [replace(v, name=f"{path.stem}: {v.name}") if names[v.name] > 1 else v for v in registration.views]
+    return replace(read[0], views=tuple(views)), files
+
+
 def assess_registration(
     registration: Registration,
-    path: Path,
+    files: Sequence[Path],
     points: Sequence[ControlPoint] | None,
     cloud: Path | None,
     *,
@@ -29,18 +56,19 @@ def assess_registration(
 ) -> tuple[tuple[ViewAssessment, ...], list[Any]]:
     """The assessments, and the photos' pixels where ``pictures`` or the cloud need them (else ``None``).
 
-    Raises FileError where a file cannot be used, and where there is nothing at all to evaluate.
+    ``files`` are those of each view's registration. Raises FileError where one cannot be used, and where there is
+    nothing at all to evaluate.
     """
     views = registration.views
     try:
         assessed = assess(registration, points)
     except InvalidInputError as error:
-        raise FileError(path, str(error)) from error
-    blind = [a.view.name for a in assessed if a.evaluation is None and a.view.covariance is None]
+        raise FileError(files[0], str(error)) from error
+    blind = [i for i, a in enumerate(assessed) if a.evaluation is None and a.view.covariance is None]
     if blind and cloud is None:
         raise FileError(
-            path,
-            f"view {blind[0]!r} has neither points nor a covariance to evaluate it by",
+            files[blind[0]],
+            f"view {views[blind[0]].name!r} has neither points nor a covariance to evaluate it by",
             "give points (name,X,Y,Z,x,y) with --points, or the scan with --cloud",
         )
     photos: list[Any] = [None] * len(views)
@@ -51,7 +79,8 @@ def assess_registration(
     if cloud is None:
         return assessed, photos
     if any(photo is None for photo in photos):
-        raise FileError(path, "a view names no photo to compare the cloud with", "give its image, or leave out --cloud")
+        file = next(file for file, photo in zip(files, photos, strict=True) if photo is None)
+        raise FileError(file, "a view names no photo to compare the cloud with", "give its image, or leave out --cloud")
     from .agreement import agreements
     from .surface_picture import cloud_before, surface_picture
 

@@ -254,6 +254,9 @@ pub(super) fn information(rows: &[([f64; 2], [f64; 3])], parameters: usize) -> D
 /// The motion, to be applied after the present transformation, that brings the pairs closest together.
 pub(super) fn increment(pairs: &Pairs, motion: Motion) -> Result<Matrix3<f64>> {
     let units = Units::of(&pairs.moved)?;
+    if motion == Motion::Rigid && pairs.weights().is_empty() {
+        return Ok(units.global(&rigid(pairs, &units)));
+    }
     let mut h = Matrix3::identity();
     for _ in 0..20 {
         let (n, g) = match motion {
@@ -281,6 +284,27 @@ pub(super) fn increment(pairs: &Pairs, motion: Motion) -> Result<Matrix3<f64>> {
         }
     }
     Ok(units.global(&h))
+}
+
+/// Turn and shift of pairs that all weigh the same, in local coordinates, whose origin is the centroid of what is moved:
+/// in closed form, because it needs the pairs once.
+///
+/// Source: K. Arun, T. Huang and S. Blostein, Least-squares fitting of two 3-D point sets, 1987, in the plane.
+fn rigid(pairs: &Pairs, units: &Units) -> Matrix3<f64> {
+    let starts: Vec<usize> = (0..pairs.len()).step_by(CHUNK).collect();
+    let part = |&from: &usize| {
+        let chunk = from..(from + CHUNK).min(pairs.len());
+        let places = pairs.moved[chunk.clone()].iter().zip(&pairs.goals[chunk]);
+        places.fold([0.0; 4], |[dot, cross, x, y], (p, q)| {
+            let (u, v) = (units.local(p), units.local(q));
+            [dot + u[0] * v[0] + u[1] * v[1], cross + u[0] * v[1] - u[1] * v[0], x + v[0], y + v[1]]
+        })
+    };
+    let parts: Vec<[f64; 4]> = starts.par_iter().map(part).collect();
+    let [dot, cross, x, y] = parts.iter().fold([0.0; 4], |sum, part| std::array::from_fn(|k| sum[k] + part[k]));
+    let (s, c) = cross.atan2(dot).sin_cos();
+    let n = pairs.len() as f64;
+    Matrix3::new(c, -s, x / n, s, c, y / n, 0.0, 0.0, 1.0)
 }
 
 /// `N⁺ g`: directions that the pairs say nothing about keep their value.

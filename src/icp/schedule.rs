@@ -53,16 +53,15 @@ impl Schedule {
     }
 
     pub fn reduce(&mut self, residuals: &Residuals) {
+        if self.reduction == 1.0 {
+            self.slack = 0.0;
+            return;
+        }
         let end = self.end(residuals);
         // No pair is lost by a threshold above all residuals; residuals that grow do not widen it again, or it could
         // swing for ever.
         let next = if residuals.largest <= end { end } else { (self.threshold * self.reduction).max(end) };
-        if self.reduction < 1.0 {
-            self.threshold = self.threshold.min(next);
-        }
+        self.threshold = self.threshold.min(next);
         self.slack = (self.threshold * self.threshold - end * end).max(0.0).sqrt() / 3.0;
-        if self.reduction == 1.0 {
-            self.slack = 0.0;
-        }
     }
 }

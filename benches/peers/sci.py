@@ -1,4 +1,4 @@
-"""How fast is a synthetic camera image of 10 million points in 12 megapixels, against NumPy and numba?
+"""How fast is a synthetic camera image of 10 million points in 12 megapixels, against NumPy, numba and Open3D?
 
 The job: project all points with distortion, keep the nearest in each pixel, and give its depth and its intensity;
 once with footprints of one pixel and once with each point drawn into 3 x 3 pixels, so that near surfaces hide some of
@@ -6,8 +6,9 @@ what shines through between their points. What colourreg does by default instead
 points, also holds where gaps are wider than that; it has a row of its own, and so has the whole of `render_sci`,
 which corrects and stretches the intensity, fills holes and gives each point's index and place as well. Points in the
 order of the scan and shuffled. All contenders run in turn in processes of their own on the same input; numba's
-compilation is not timed, nor is any import. Depths are compared with NumPy's. Limits: a made-up building of walls at
-four distances; a machine that does other things moves all figures, the ratios less.
+compilation is not timed, nor is any import. Open3D draws one pixel to the point alone. Depths are compared with
+NumPy's. Limits: a made-up building of walls at four distances; a machine that does other things moves all figures, the
+ratios less.
 
     python -m benches.peers.sci [--points 10000000] [--repeats 3]
 """
@@ -160,6 +161,30 @@ def numba_private_buffers(points, order, footprint):
     return _timed(run, points, order, footprint)
 
 
+def by_open3d(xyz, intensity):
+    """Seconds with and without the making of its cloud. It knows no distortion and works in float32."""
+    import open3d
+
+    fx, fy, cx, cy = building.camera(WIDTH, HEIGHT)[:4]
+    intrinsics = open3d.core.Tensor(np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]))
+    begin = time.perf_counter()
+    made = open3d.t.geometry.PointCloud(open3d.core.Tensor(xyz.astype(np.float32)))
+    made.point.colors = open3d.core.Tensor(np.repeat(intensity[:, None] / np.float32(65535), 3, axis=1))
+    at_hand = time.perf_counter()
+    image = made.project_to_rgbd_image(WIDTH, HEIGHT, intrinsics, depth_scale=1.0, depth_max=1e4)
+    end = time.perf_counter()
+    assert (image.depth.as_tensor().numpy() > 0).any(), "Open3D drew nothing"
+    return end - begin, end - at_hand
+
+
+def open3d(points, order, footprint):
+    return by_open3d(*cloud(int(points), order))[0]
+
+
+def open3d_cloud_at_hand(points, order, footprint):
+    return by_open3d(*cloud(int(points), order))[1]
+
+
 def main() -> None:
     arguments = parser((__doc__ or "").splitlines()[0]).parse_args()
     contenders = {"colourreg": colourreg, "numpy minimum.at": numpy_minimum_at}
@@ -167,13 +192,18 @@ def main() -> None:
         contenders["numba"] = numba_private_buffers
     else:
         print("numba is not installed and left out")
+    one_pixel = dict(contenders)
+    if importlib.util.find_spec("open3d"):
+        one_pixel |= {"open3d": open3d, "open3d, its cloud at hand": open3d_cloud_at_hand}
+    else:
+        print("open3d is not installed and left out")
     ours = {}
     for footprint in ("1", "3"):
         for order in ("scan", "shuffled"):
             what = "one pixel" if footprint == "1" else "3 x 3 pixels"
             print(f"\n{arguments.points:,} points in {WIDTH} x {HEIGHT}, footprints of {what}, in {order} order")
             extra = {"colourreg, surfaces": colourreg_surfaces, "colourreg, render_sci": colourreg_render_sci}
-            all_of_them = contenders if footprint == "1" else {**contenders, **extra}
+            all_of_them = one_pixel if footprint == "1" else {**contenders, **extra}
             figures = compare(all_of_them, [str(arguments.points), order, footprint], arguments.repeats)
             ours[footprint, order] = figures[0].seconds
     for footprint in ("1", "3"):

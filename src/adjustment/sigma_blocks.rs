@@ -64,9 +64,15 @@ fn fill_block_anywhere(sigma: &SurfaceSigma, faces: &[Face], xyz: &[[f64; 3]], s
         }
     }
     if let Some(planes) = slopes.planes {
+        // All places first: the memory has time to bring what lies in them.
+        let mut cells = [None; BLOCK];
         for i in 0..n {
-            if !is_direction([normal[0][i], normal[1][i], normal[2][i]])
-                && let Some(found) = planes.normal([ray[0][i], ray[1][i], ray[2][i]])
+            cells[i] = planes.locate(pick(&ray, i));
+        }
+        for i in 0..n {
+            if !is_direction(pick(&normal, i))
+                && let Some(cell) = cells[i]
+                && let Some(found) = planes.normal_in(cell, pick(&ray, i))
             {
                 for a in 0..3 {
                     normal[a][i] = found[a];

@@ -14,7 +14,7 @@ use super::zbuffer::Grid;
 use crate::geometry::{Camera, Depth, Pose, View, forward_field};
 
 /// The smallest and the largest cell, pixels.
-const CELL: [f64; 2] = [8.0, 48.0];
+const CELL: [f64; 2] = [12.0, 48.0];
 /// Samples that a cell is to be wide, about.
 const SAMPLES_ACROSS: f64 = 3.0;
 /// A window's radius as a part of a cell.
@@ -50,6 +50,15 @@ pub struct LocalPlanes {
     noise: f32,
 }
 
+/// Where on the grid a point lies.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct PlaneCell {
+    face: u32,
+    column: u32,
+    row: u32,
+    depth: f32,
+}
+
 /// One of the six pyramids about the projection centre, or the only one.
 #[derive(Debug, Clone)]
 struct Face {
@@ -80,27 +89,43 @@ impl LocalPlanes {
         Self { pose: view.pose, faces, noise }
     }
 
-    /// The normal, of any length and sign, of the surface on which a point of the camera frame lies; `None` where no plane
-    /// was found near it.
+    /// Where the planes of a point of the camera frame are found; the memory is asked for them. `None` outside the grid.
     #[inline(always)]
-    pub fn normal(&self, q: [f32; 3]) -> Option<[f32; 3]> {
-        let face = if self.faces.len() == 1 {
-            &self.faces[0]
+    pub fn locate(&self, q: [f32; 3]) -> Option<PlaneCell> {
+        let number = if self.faces.len() == 1 {
+            0
         } else {
             let size = q.map(f32::abs);
             let k = if size[0] >= size[1] && size[0] >= size[2] { 0 } else { 2 - usize::from(size[1] >= size[2]) };
-            &self.faces[2 * k + usize::from(q[k] < 0.0)]
+            2 * k + usize::from(q[k] < 0.0)
         };
+        let face = &self.faces[number];
         let depth = face.sign as f32 * q[face.axes[2]];
-        let place = [0, 1].map(|k| (q[face.axes[k]] / depth - face.low[k] as f32) / face.step as f32);
+        let scale = 1.0 / (depth * face.step as f32);
+        let place = [0, 1].map(|k| q[face.axes[k]] * scale - face.low[k] as f32 / face.step as f32);
         let inside = depth > 0.0 && (0..2).all(|k| place[k] >= 0.0 && place[k] < face.size[k] as f32);
         if !inside {
             return None;
         }
-        let [allowed, most] = OFF.map(|(relative, sigmas)| relative + sigmas * self.noise / depth);
-        let [column, row] = place.map(|x| x as usize);
+        let [column, row] = place.map(|x| x as u32);
+        super::fetch(&face.cells, row * face.size[0] as u32 + column);
+        Some(PlaneCell { face: number as u32, column, row, depth })
+    }
+
+    /// The normal, of any length and sign, of the surface on which a point of the camera frame lies; `None` where no plane
+    /// was found near it.
+    #[inline(always)]
+    pub fn normal_in(&self, cell: PlaneCell, q: [f32; 3]) -> Option<[f32; 3]> {
+        let face = &self.faces[cell.face as usize];
+        let [allowed, most] = OFF.map(|(relative, sigmas)| relative + sigmas * self.noise / cell.depth);
+        let [column, row] = [cell.column as usize, cell.row as usize];
         face.closest(q, [column..column + 1, row..row + 1], allowed)
             .or_else(|| self.beside(face, q, [column, row], most))
+    }
+
+    /// As [`LocalPlanes::normal_in`], for one point alone.
+    pub fn normal(&self, q: [f32; 3]) -> Option<[f32; 3]> {
+        self.normal_in(self.locate(q)?, q)
     }
 
     /// The planes of the neighbouring cells: at edges a surface may take a small part of its cell only.

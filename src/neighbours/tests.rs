@@ -187,9 +187,9 @@ fn a_known_neighbour_changes_nothing_but_the_time() {
 
 #[test]
 fn far_queries_are_answered_and_nothing_is_nearer_than_the_rest() {
-    // A crowded line in a wide, nearly empty field: the cells are small, and most of the field is far from all points.
+    // A crowded strip in a wide, nearly empty field: the cells are small, and most of the field is far from all points.
     let mut numbers = Numbers(7);
-    let mut points: Vec<[f64; 2]> = (0..3000).map(|i| [f64::from(i) / 3.0, 500.0 + numbers.next()]).collect();
+    let mut points: Vec<[f64; 2]> = (0..3000).map(|i| [f64::from(i) / 3.0, 500.0 + 30.0 * numbers.next()]).collect();
     points.extend((0..100).map(|_| [1000.0 * numbers.next(), 1000.0 * numbers.next()]));
     points.push(points[17]);
     let index = Neighbours::new(&points).unwrap();

@@ -316,8 +316,8 @@ def test_what_the_command_cannot_do_is_one_line_and_no_file(tmp_path, rng):
 
 
 #: How many points are interpolated, at least; and of them, those that no ray through their pixel meets within 5 sigma
-#: and 2 cm: at most. 0.0010, 0.0001 and 0.0012 were measured, of scans sparser than those in the documents: a few points
-#: more or less are chance.
+#: and 2 cm: at most. 0.0010, 0.0001 and 0.0012 were measured, of scans sparser than those in the documents: a few
+#: points more or less are chance.
 MADE = {"corner": 14_000, "square": 145_000, "facade": 175_000}
 WRONG_INTERPOLATED = {"corner": 0.0015, "square": 0.0005, "facade": 0.002}
 SIZES = {"corner": ((900, 600), 200_000), "square": ((720, 480), 250_000), "facade": ((720, 480), 150_000)}

@@ -13,8 +13,10 @@ use super::sample::Sample;
 use super::zbuffer::Grid;
 use crate::geometry::{Camera, Depth, Pose, View, forward_field};
 
-/// The smallest and the largest cell, pixels.
-const CELL: [f64; 2] = [12.0, 48.0];
+/// The smallest cell of slopes and the smallest in which the noise of depths is looked for, pixels.
+const SMALLEST: [f64; 2] = [12.0, 8.0];
+/// The largest, pixels.
+const LARGEST: f64 = 48.0;
 /// Samples that a cell is to be wide, about.
 const SAMPLES_ACROSS: f64 = 3.0;
 /// A window's radius as a part of a cell.
@@ -74,7 +76,7 @@ struct Face {
 impl LocalPlanes {
     /// From the samples in the cells of a grid.
     pub fn new(view: &View, grid: Grid, samples: &[Sample]) -> Self {
-        let (looks, mut faces) = prepared(view, grid, samples);
+        let (looks, mut faces) = prepared(view, grid, samples, SMALLEST[0]);
         let noise = looks.depth_noise(&faces, PLACE);
         for face in &mut faces {
             let [columns, rows] = face.size;
@@ -154,14 +156,14 @@ impl LocalPlanes {
 
 /// Sigma of a depth, in the cloud's unit, as samples scatter about local planes, whose places are good to `place` pixels.
 pub(super) fn depth_noise(view: &View, grid: Grid, samples: &[Sample], place: f32) -> f32 {
-    let (looks, faces) = prepared(view, grid, samples);
+    let (looks, faces) = prepared(view, grid, samples, SMALLEST[1]);
     looks.depth_noise(&faces, place)
 }
 
-/// What planes are fitted to, and the empty faces for them.
-fn prepared<'a>(view: &View, grid: Grid, samples: &'a [Sample]) -> (Looks<'a>, Vec<Face>) {
+/// What planes are fitted to, and the empty faces for them, of cells that are at least so large.
+fn prepared<'a>(view: &View, grid: Grid, samples: &'a [Sample], smallest: f64) -> (Looks<'a>, Vec<Face>) {
     let fill = density(&grid, samples);
-    let pixels = (SAMPLES_ACROSS / fill.sqrt()).clamp(CELL[0], CELL[1]);
+    let pixels = (SAMPLES_ACROSS / fill.sqrt()).clamp(smallest, LARGEST);
     let step = pixels * f64::from(super::pixel_angle(view));
     let face = |axes, sign, low: [f64; 2], high: [f64; 2]| {
         let size = [0, 1].map(|k| ((high[k] - low[k]) / step).ceil().clamp(1.0, 4096.0) as usize);

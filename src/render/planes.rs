@@ -13,12 +13,10 @@ use super::sample::Sample;
 use super::zbuffer::Grid;
 use crate::geometry::{Camera, Depth, Pose, View, forward_field};
 
-/// The smallest cell of slopes and the smallest in which the noise of depths is looked for, pixels.
-const SMALLEST: [f64; 2] = [12.0, 8.0];
-/// The largest, pixels.
-const LARGEST: f64 = 48.0;
-/// Samples that a cell is to be wide, about.
-const SAMPLES_ACROSS: f64 = 3.0;
+/// The smallest and the largest cell, pixels.
+const CELL: [f64; 2] = [8.0, 48.0];
+/// Samples that a cell of slopes is to be wide, about, and one in which the noise of depths is looked for.
+const SAMPLES_ACROSS: [f64; 2] = [7.0, 3.0];
 /// A window's radius as a part of a cell.
 const RADIUS: f64 = 0.75;
 /// The largest radius, pixels.
@@ -40,8 +38,10 @@ const BLOCK: (usize, usize) = (64, 3);
 /// Of so many cells, across and down, one says how noisy depths are.
 const EVERY: usize = 5;
 
-/// Up to two planes, n · X = 1 in the camera frame; zeros for none.
-type Cell = [[f32; 3]; LAYERS];
+/// Up to two planes, n · X = 1 in the camera frame; zeros for none. Never across the border of a line of the cache.
+#[derive(Debug, Clone, Copy, Default)]
+#[repr(align(32))]
+struct Cell([[f32; 3]; LAYERS]);
 
 /// Local planes over what a view sees.
 #[derive(Debug, Clone)]
@@ -76,11 +76,11 @@ struct Face {
 impl LocalPlanes {
     /// From the samples in the cells of a grid.
     pub fn new(view: &View, grid: Grid, samples: &[Sample]) -> Self {
-        let (looks, mut faces) = prepared(view, grid, samples, SMALLEST[0]);
+        let (looks, mut faces) = prepared(view, grid, samples, SAMPLES_ACROSS[0]);
         let noise = looks.depth_noise(&faces, PLACE);
         for face in &mut faces {
             let [columns, rows] = face.size;
-            let mut cells = vec![[[0.0; 3]; LAYERS]; columns * rows];
+            let mut cells = vec![Cell::default(); columns * rows];
             cells.par_chunks_mut(columns).enumerate().for_each_init(Vec::new, |spots, (row, cells)| {
                 for (column, cell) in cells.iter_mut().enumerate() {
                     *cell = looks.planes(face, [column, row], noise, spots);
@@ -156,14 +156,14 @@ impl LocalPlanes {
 
 /// Sigma of a depth, in the cloud's unit, as samples scatter about local planes, whose places are good to `place` pixels.
 pub(super) fn depth_noise(view: &View, grid: Grid, samples: &[Sample], place: f32) -> f32 {
-    let (looks, faces) = prepared(view, grid, samples, SMALLEST[1]);
+    let (looks, faces) = prepared(view, grid, samples, SAMPLES_ACROSS[1]);
     looks.depth_noise(&faces, place)
 }
 
-/// What planes are fitted to, and the empty faces for them, of cells that are at least so large.
-fn prepared<'a>(view: &View, grid: Grid, samples: &'a [Sample], smallest: f64) -> (Looks<'a>, Vec<Face>) {
+/// What planes are fitted to, and the empty faces for them, of cells that are about so many samples across.
+fn prepared<'a>(view: &View, grid: Grid, samples: &'a [Sample], across: f64) -> (Looks<'a>, Vec<Face>) {
     let fill = density(&grid, samples);
-    let pixels = (SAMPLES_ACROSS / fill.sqrt()).clamp(smallest, LARGEST);
+    let pixels = (across / fill.sqrt()).clamp(CELL[0], CELL[1]);
     let step = pixels * f64::from(super::pixel_angle(view));
     let face = |axes, sign, low: [f64; 2], high: [f64; 2]| {
         let size = [0, 1].map(|k| ((high[k] - low[k]) / step).ceil().clamp(1.0, 4096.0) as usize);
@@ -273,7 +273,7 @@ impl Looks<'_> {
 
     /// The planes about a cell, from the smallest window that tells them well enough.
     fn planes(&self, face: &Face, cell: [usize; 2], depth_noise: f32, spots: &mut Vec<Spot>) -> Cell {
-        let mut result = [[0.0; 3]; LAYERS];
+        let mut result = Cell::default();
         let Some(window) = self.window(face, cell) else { return result };
         let mut radius = RADIUS * self.pixels;
         loop {
@@ -281,7 +281,7 @@ impl Looks<'_> {
             let noise = Noise { depth: depth_noise, rounding: ROUNDING, place: PLACE / radius as f32 };
             let found = planes_in(spots, &noise);
             let tangents = found.map(|plane| plane.map_or(f32::INFINITY, |p| tangent_sigma(&p, unit as f32, &noise)));
-            for ((result, plane), tangent) in result.iter_mut().zip(found).zip(tangents) {
+            for ((result, plane), tangent) in result.0.iter_mut().zip(found).zip(tangents) {
                 if let Some(plane) = plane.filter(|_| tangent < USELESS) {
                     *result = face.normal(&plane, window.middle, unit);
                 }
@@ -333,7 +333,7 @@ impl Face {
     fn closest(&self, q: [f32; 3], [columns, rows]: [Range<usize>; 2], allowed: f32) -> Option<[f32; 3]> {
         let (mut best, mut least) = (None, allowed);
         for row in rows {
-            for n in self.cells[row * self.size[0]..][columns.clone()].iter().flatten() {
+            for n in self.cells[row * self.size[0]..][columns.clone()].iter().flat_map(|cell| &cell.0) {
                 let off = (n[0] * q[0] + n[1] * q[1] + n[2] * q[2] - 1.0).abs();
                 if off <= least {
                     (best, least) = (Some(*n), off);

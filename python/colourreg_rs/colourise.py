@@ -122,6 +122,9 @@ class Colouriser:
     def __init__(self, views: Sequence[View], options: ColouriseOptions | None = None) -> None:
         if not views:
             raise InvalidInputError("there is no view to colour from")
+        limit = (options or ColouriseOptions()).max_sigma
+        if limit is not None and not limit > 0:
+            raise InvalidInputError(f"a largest ColourSigma of {limit} is not possible: give metres above zero")
         self.views = tuple(views)
         self.options = options or ColouriseOptions()
         self._photos = PhotoShelf((), ())
@@ -214,7 +217,9 @@ def _surface_sigma(view: View, options: ColouriseOptions) -> _core.SurfaceSigma 
 def load_views(paths: Sequence[Path]) -> list[View]:
     """All views of all registrations, in order, whose photos exist and have the size that is told. Raises FileError."""
     views = []
-    for path in paths:
+    for i, path in enumerate(paths):
+        if path.resolve() in [earlier.resolve() for earlier in paths[:i]]:
+            raise FileError(path, "is given twice", "name each registration once")
         for view in read_registration(path).views:
             if view.image is None:
                 raise FileError(path, f"view {view.name!r} names no photo", "give its image")

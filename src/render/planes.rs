@@ -15,8 +15,8 @@ use crate::geometry::{Camera, Depth, Pose, View, forward_field};
 
 /// The smallest and the largest cell, pixels.
 const CELL: [f64; 2] = [8.0, 48.0];
-/// Samples that a cell of slopes is to be wide, about, and one in which the noise of depths is looked for.
-const SAMPLES_ACROSS: [f64; 2] = [7.0, 3.0];
+/// Samples that a cell is to be wide, about.
+const SAMPLES_ACROSS: f64 = 3.0;
 /// A window's radius as a part of a cell.
 const RADIUS: f64 = 0.75;
 /// The largest radius, pixels.
@@ -76,7 +76,7 @@ struct Face {
 impl LocalPlanes {
     /// From the samples in the cells of a grid.
     pub fn new(view: &View, grid: Grid, samples: &[Sample]) -> Self {
-        let (looks, mut faces) = prepared(view, grid, samples, SAMPLES_ACROSS[0]);
+        let (looks, mut faces) = prepared(view, grid, samples);
         let noise = looks.depth_noise(&faces, PLACE);
         for face in &mut faces {
             let [columns, rows] = face.size;
@@ -156,14 +156,14 @@ impl LocalPlanes {
 
 /// Sigma of a depth, in the cloud's unit, as samples scatter about local planes, whose places are good to `place` pixels.
 pub(super) fn depth_noise(view: &View, grid: Grid, samples: &[Sample], place: f32) -> f32 {
-    let (looks, faces) = prepared(view, grid, samples, SAMPLES_ACROSS[1]);
+    let (looks, faces) = prepared(view, grid, samples);
     looks.depth_noise(&faces, place)
 }
 
-/// What planes are fitted to, and the empty faces for them, of cells that are about so many samples across.
-fn prepared<'a>(view: &View, grid: Grid, samples: &'a [Sample], across: f64) -> (Looks<'a>, Vec<Face>) {
+/// What planes are fitted to, and the empty faces for them.
+fn prepared<'a>(view: &View, grid: Grid, samples: &'a [Sample]) -> (Looks<'a>, Vec<Face>) {
     let fill = density(&grid, samples);
-    let pixels = (across / fill.sqrt()).clamp(CELL[0], CELL[1]);
+    let pixels = (SAMPLES_ACROSS / fill.sqrt()).clamp(CELL[0], CELL[1]);
     let step = pixels * f64::from(super::pixel_angle(view));
     let face = |axes, sign, low: [f64; 2], high: [f64; 2]| {
         let size = [0, 1].map(|k| ((high[k] - low[k]) / step).ceil().clamp(1.0, 4096.0) as usize);

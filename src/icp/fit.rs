@@ -302,8 +302,9 @@ fn rigid(pairs: &Pairs, units: &Units) -> Matrix3<f64> {
     };
     let parts: Vec<[f64; 4]> = starts.par_iter().map(part).collect();
     let [dot, cross, x, y] = parts.iter().fold([0.0; 4], |sum, part| std::array::from_fn(|k| sum[k] + part[k]));
-    let (s, c) = cross.atan2(dot).sin_cos();
     let n = pairs.len() as f64;
+    // Goals in one place say nothing of the turn: what is left of the sums then is rounding.
+    let (s, c) = if dot.hypot(cross) > 1e-9 * n { cross.atan2(dot).sin_cos() } else { (0.0, 1.0) };
     Matrix3::new(c, -s, x / n, s, c, y / n, 0.0, 0.0, 1.0)
 }
 

@@ -284,10 +284,12 @@ class LasOutput(CloudWriter):
         self._out.commit()
 
     def discard(self) -> None:
-        if self._disk is not None:
-            with contextlib.suppress(Exception):
-                self._disk.done()
-        self._out.discard()
+        try:
+            if self._disk is not None:
+                with contextlib.suppress(Exception):
+                    self._disk.done()
+        finally:  # also when the wait is interrupted
+            self._out.discard()
 
 
 class LasWriter(LasOutput):

@@ -25,8 +25,8 @@ use tile::Tile;
 const TILE: usize = 64;
 /// So many tiles tell how regularly a scan samples its surfaces.
 const TOLD: usize = 64;
-/// An opening between samples may be wider than those of the scan usually are by this factor, and by twice the one from
-/// their lower quartile to their median.
+/// An opening between samples may be wider than those of the scan usually are by this factor, and by the square of the
+/// one from their lower quartile to their median.
 const WIDER: f64 = 1.3;
 
 /// Where a depth comes from.

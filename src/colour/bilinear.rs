@@ -43,7 +43,8 @@ impl Places {
 /// the photo to be read in one go; the colours on the 16-bit scale, with a fourth number without meaning.
 ///
 /// # Safety
-/// The processor has AVX2. `width` × `height` is the number of the pixels and below 2³¹.
+/// The processor has AVX2. `width` × `height` is the number of the pixels, of which there is at least one and
+/// whose bytes can be counted in an i32.
 #[target_feature(enable = "avx2")]
 pub(super) unsafe fn each(
     values: &[[u8; 3]],

@@ -122,7 +122,7 @@ impl<'a> Colourist<'a> {
         #[cfg(target_arch = "x86_64")]
         if std::arch::is_x86_feature_detected!("avx2") {
             if let Some((values, size)) = self.photos[view].simple(self.interpolation) {
-                // SAFETY: the processor has the feature, and a photo's pixels can be counted in an i32.
+                // SAFETY: the processor has the feature, and the bytes of a simple photo can be counted in an i32.
                 return unsafe { self.take_bilinear(view, values, size, sight, rgb, source) };
             }
             // SAFETY: the processor has the feature.

@@ -93,7 +93,7 @@ impl Flat {
         true
     }
 
-    /// The blocks of a row: the columns with which they begin, and the spacing code of those that are flat.
+    /// The blocks of a row, from left to right: the spacing code of those that are flat, 0 for the others.
     pub fn row(&self, row: usize) -> &[u8] {
         &self.blocks[(row - self.first_row) / BLOCK * self.columns..][..self.columns]
     }
@@ -220,7 +220,7 @@ mod tests {
     }
 
     /// Samples of what `inverse(column, row)` says of the grid's cells, half of which have one; which blocks of all rows are
-    /// flat, and the limits.
+    /// flat, and the limits; behind the grid and the samples themselves.
     fn found(inverse: impl Fn(f32, f32) -> Option<f32>) -> (Grid, Vec<Sample>, Vec<Vec<bool>>, Vec<f32>) {
         let grid = grid();
         let mut state = 7_u32;

@@ -235,7 +235,7 @@ impl FirstLook<'_> {
 /// edge there are none, so that surfaces do not grow; and of a plane the lower is never in front.
 fn close(grid: &Grid, limit: &mut [f32]) {
     let (stride, rows) = (grid.stride(), grid.rows());
-    // Each band works from a copy of itself and of two rows on either side, which are taken before anything changes.
+    // Each band works from copies of two rows on either side, which are taken before anything changes.
     let bands = rows.div_ceil(CLOSED_ROWS);
     let beside: Vec<[Vec<f32>; 2]> = (0..bands)
         .map(|band| {
@@ -246,7 +246,8 @@ fn close(grid: &Grid, limit: &mut [f32]) {
         .collect();
     limit.par_chunks_mut(CLOSED_ROWS * stride).zip(beside).enumerate().for_each(|(band, (cells, [above, below]))| {
         let first = band * CLOSED_ROWS;
-        // What becomes of a row is asked for by two more: three rows are kept as they were, so that all stays in the cache.
+        // The two rows before have changed by now: they and the row itself are kept as they were, so that all stays in
+        // the cache.
         let mut kept: [Vec<f32>; 3] = std::array::from_fn(|_| vec![0.0; stride]);
         for (row, old) in above.chunks(stride).enumerate() {
             kept[(first + row + 3 - above.len() / stride) % 3].copy_from_slice(old);

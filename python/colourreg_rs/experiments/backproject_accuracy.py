@@ -32,7 +32,7 @@ from ..simulate import Simulation, simulate
 #: Pixels and points of the scenes' photos and scans.
 SIZES = {"corner": ((1500, 1000), 500_000), "square": ((1200, 800), 600_000), "facade": ((1200, 800), 400_000)}
 
-#: Of a photo's and a scan's usual size, where none is named.
+#: The same for scenes that are not named there.
 USUAL = ((1200, 800), 500_000)
 
 #: How far surfaces are extended, px.
@@ -55,7 +55,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Truth:
-    """What nine rays through each of N pixels meet: distances (9, N), the middle one fifth, and primitives likewise."""
+    """What nine rays through each of N pixels meet: distances (9, N), the middle one the fifth; primitives likewise."""
 
     distance: FloatArray
     primitive: npt.NDArray[np.int64]

@@ -372,3 +372,40 @@ fn wishes_that_make_no_sense_are_refused() {
     let sets = Sets { target_covariance: Some(&negative), ..plain(&points, &points) };
     assert!(run(&sets, &usual).unwrap_err().to_string().contains("target point 0"));
 }
+
+#[test]
+fn goals_in_one_place_turn_nothing() {
+    let mut numbers = Numbers(11);
+    let source = numbers.points(500);
+    let corner = [[1500.0, -300.0]];
+    let options = Options {
+        motion: Motion::Rigid,
+        threshold: Some(1e4),
+        reduction: 1.0,
+        max_iterations: 1,
+        ..Options::default()
+    };
+    let report = run(&plain(&source, &corner), &options).unwrap();
+    assert_eq!(report.parameters[0], 0.0);
+    let centre: [f64; 2] =
+        std::array::from_fn(|d| moved(&report.transform, &source).iter().map(|p| p[d]).sum::<f64>() / 500.0);
+    assert!((centre[0] - 1500.0).abs() < 1e-9 && (centre[1] + 300.0).abs() < 1e-9, "{centre:?}");
+}
+
+#[test]
+fn pairs_keep_their_numbers_where_many_points_have_no_partner() {
+    let mut numbers = Numbers(12);
+    let source = numbers.points(20_001);
+    let target: Vec<[f64; 2]> = source.iter().copied().step_by(2).collect();
+    let options = Options {
+        motion: Motion::Rigid,
+        threshold: Some(1e-3),
+        reduction: 1.0,
+        max_iterations: 1,
+        ..Options::default()
+    };
+    let mut pairs = run(&plain(&source, &target), &options).unwrap().pairs;
+    pairs.sort_unstable();
+    assert!(pairs.len() == target.len());
+    assert!(pairs.iter().enumerate().all(|(k, pair)| *pair == [2 * k as u32, k as u32]));
+}

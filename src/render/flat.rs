@@ -19,6 +19,8 @@ const WIDE: usize = TILE + 2 * AROUND;
 const NARROW: usize = BLOCK + 2 * AROUND;
 /// What the misfit of a patch is of the noise of one inverse depth, on the average.
 const MISFIT: f32 = 2.0;
+/// How widely the samples of a fit have to lie, of the squares of both axes as they are for a full window.
+const SPREAD: f64 = 0.25;
 
 /// Which blocks of a band of rows are flat.
 pub(super) struct Flat {
@@ -137,6 +139,11 @@ fn plane<const WINDOW: usize>(samples: &[Sample], stride: usize, rule: &Rule) ->
     let (x, y, w) = (x / n, y / n, w / n);
     let (xx, xy, yy, xw, yw) = (xx / n - x * x, xy / n - x * y, yy / n - y * y, xw / n - x * w, yw / n - y * w);
     let det = xx * yy - xy * xy;
+    // What it is for samples everywhere in the window.
+    let whole = (WINDOW as f64).powi(4) / 144.0;
+    if det.is_nan() || det < SPREAD * whole {
+        return None;
+    }
     let gradient = [(yy * xw - xy * yw) / det, (xx * yw - xy * xw) / det];
     let middle = w - gradient[0] * x - gradient[1] * y;
     let ([gx, gy], own) = (gradient.map(|g| g as f32), reference + middle as f32);
@@ -153,7 +160,6 @@ fn plane<const WINDOW: usize>(samples: &[Sample], stride: usize, rule: &Rule) ->
             }
         }
     }
-    // Without a plane the slack is NaN, and nothing is below it.
     let flat = most.iter().all(|&off| off <= slack);
     let fill = (n as f32) * every as f32 / (WINDOW * WINDOW) as f32;
     flat.then_some(Plane { middle: own, gradient: [gx, gy], slack, fill })
@@ -282,6 +288,29 @@ mod tests {
                 assert!(!flat_at(&blocks, x, middle.1 as usize), "{name} {x}");
             }
             assert!(flat_at(&blocks, 40, 40) && flat_at(&blocks, 120, 40), "{name}");
+        }
+    }
+
+    #[test]
+    fn samples_whose_rows_tell_no_slope_give_no_plane() {
+        // The fit looks at every other row, and of these only one holds samples, all at the same place in their pixels.
+        let mut state = 3_u32;
+        let mut random = || {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            (state >> 8) as f32 / (1 << 24) as f32
+        };
+        for row in (0..WIDE).step_by(2).cycle().take(600) {
+            let mut samples = vec![Sample::default(); WIDE * WIDE];
+            for y in (0..WIDE).filter(|y| y % 2 == 1 || *y == row) {
+                for x in 0..WIDE {
+                    let noise = 3.46 * NOISE * 0.01 * (random() - 0.5);
+                    if y % 2 == 1 || random() < 0.5 {
+                        samples[y * WIDE + x] = Sample::new(0.1 + noise, [0.5, 0.5]);
+                    }
+                }
+            }
+            let found = plane::<WIDE>(&samples, WIDE, &rule());
+            assert!(found.is_none(), "{found:?}");
         }
     }
 

@@ -53,7 +53,7 @@ pub struct LocalPlanes {
 }
 
 /// Where on the grid a point lies.
-#[derive(Debug, Clone, Copy, Default)]
+#[derive(Debug, Clone, Copy)]
 pub struct PlaneCell {
     face: u32,
     column: u32,

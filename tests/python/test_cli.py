@@ -106,8 +106,13 @@ def test_several_registrations_are_evaluated_together(job, tmp_path):
         "view first: photo", "view second: photo", "view other",
     ]  # fmt: skip
     assert len(json.loads((tmp_path / "all.json").read_text())) == 3
+    (tmp_path / "again").mkdir()
+    write_registration(tmp_path / "again" / "second.json", Registration((view,), crs_wkt=None))
+    done = colourreg("evaluate", second, tmp_path / "again" / "second.json")
+    names = [line for line in done.stdout.splitlines() if line.startswith("view ")]
+    assert names == [f"view {second}: photo", "view other", f"view {tmp_path / 'again' / 'second.json'}: photo"]
     for wrong, what in ((first, "is given twice"), (elsewhere, "another coordinate system")):
-        done = colourreg("evaluate", first, wrong)
+        done = colourreg("evaluate", second, first, wrong)
         assert done.returncode == 1 and done.stderr.count("\n") == 1
         assert what in done.stderr and str(wrong) in done.stderr
 

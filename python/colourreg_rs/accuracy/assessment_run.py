@@ -34,14 +34,21 @@ def read_registrations(paths: Sequence[Path]) -> tuple[Registration, tuple[Path,
         return read[0], files
     names = Counter(view.name for registration in read for view in registration.views)
     views: list[View] = []
+    stems = Counter(path.stem for path in paths)
+    crs: tuple[Path, str] | None = None
     for i, (path, registration) in enumerate(zip(paths, read, strict=True)):
         if path.resolve() in [earlier.resolve() for earlier in paths[:i]]:
             raise FileError(path, "is given twice", "name each registration once")
-        if registration.crs_wkt and read[0].crs_wkt and registration.crs_wkt != read[0].crs_wkt:
-            raise FileError(
-                path, f"is in another coordinate system than {paths[0]}", "evaluate registrations of one frame together"
-            )
-        views += [replace(v, name=f"{path.stem}: {v.name}") if names[v.name] > 1 else v for v in registration.views]
+        if registration.crs_wkt:
+            crs = crs or (path, registration.crs_wkt)
+            if registration.crs_wkt != crs[1]:
+                raise FileError(
+                    path,
+                    f"is in another coordinate system than {crs[0]}",
+                    "evaluate registrations of one frame together",
+                )
+        label = path.stem if stems[path.stem] == 1 else str(path)
+        views += [replace(v, name=f"{label}: {v.name}") if names[v.name] > 1 else v for v in registration.views]
     return replace(read[0], views=tuple(views)), files
 
 

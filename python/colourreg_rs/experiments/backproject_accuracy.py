@@ -15,7 +15,6 @@ exact scene, say what it shows. For each origin of a point:
 
 from __future__ import annotations
 
-import argparse
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -28,6 +27,7 @@ from ..backproject import BackProjection, BackprojectOptions, Origin, backprojec
 from ..model import FloatArray
 from ..sci import render_sci
 from ..simulate import Simulation, simulate
+from . import options
 
 #: Pixels and points of the scenes' photos and scans.
 SIZES = {"corner": ((1500, 1000), 500_000), "square": ((1200, 800), 600_000), "facade": ((1200, 800), 400_000)}
@@ -147,20 +147,13 @@ def line(o: Outcome) -> str:
     )
 
 
-def _seeds(text: str) -> list[int]:
-    first, _, last = text.partition(":")
-    return list(range(int(first), int(last))) if last else list(range(int(first)))
-
-
 def main() -> None:
     """Prints the table."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--scene", action="append", help="corner, square, facade; several times for several")
-    parser.add_argument("--seeds", default="3", help="how many, or FIRST:END, without END itself")
+    parser = options.parser(__doc__, "corner, square, facade", "3")
     parser.add_argument("--extension", type=float, default=EXTENSION, help="of surfaces beside the scan, px")
     arguments = parser.parse_args()
     print(HEADER, flush=True)
-    for outcome in run(arguments.scene or ["corner", "square", "facade"], _seeds(arguments.seeds), arguments.extension):
+    for outcome in run(arguments.scene or ["corner", "square", "facade"], arguments.seeds, arguments.extension):
         print(line(outcome), flush=True)
 
 

@@ -13,7 +13,6 @@ Source of the region: χ² with six degrees of freedom of the error in the covar
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import json
 import pickle
@@ -30,6 +29,7 @@ from .. import _core
 from ..matching.register_sci import SciOptions, SciRegistration, register_sci
 from ..model import FloatArray, PointCloud, Pose, View
 from ..sci import render_sci, with_size
+from . import options
 
 #: χ² with six degrees of freedom holds 95 % below this.
 LIMIT_95 = 12.592
@@ -228,16 +228,9 @@ def summary(outcomes: Sequence[Outcome]) -> str:
     return "\n".join(rows)
 
 
-def _seeds(text: str) -> list[int]:
-    first, _, last = text.partition(":")
-    return list(range(int(first), int(last))) if last else list(range(int(first)))
-
-
 def main() -> None:
     """Prints both tables."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--scene", action="append", help="facade, room, square, corner; several times for several")
-    parser.add_argument("--seeds", default="10", help="how many, or FIRST:END, without END itself")
+    parser = options.parser(__doc__, "facade, room, square, corner", "10")
     parser.add_argument("--size", default="1200x800", help="of the photos")
     parser.add_argument("--start", type=float, action="append", help="0.5 or 3 degrees off; both unless one is given")
     parser.add_argument("--cache", type=Path, help="a folder that keeps the simulations")
@@ -248,7 +241,7 @@ def main() -> None:
     starts = [start for start in STARTS if start[0] in wanted]
     if len(starts) != len(set(wanted)):
         parser.error(f"--start is one of {', '.join(f'{degrees:g}' for degrees, _ in STARTS)}")
-    scenes, seeds = arguments.scene or ["facade", "room"], _seeds(arguments.seeds)
+    scenes, seeds = arguments.scene or ["facade", "room"], arguments.seeds
     outcomes = []
     print(HEADER, flush=True)
     for outcome in run(scenes, seeds, (width, height), arguments.cache, starts, arguments.keep):

@@ -15,7 +15,6 @@ it does not, whether what hides it was scanned: nothing else can be known to hid
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import pickle
 from collections.abc import Iterator, Sequence
@@ -28,6 +27,7 @@ import numpy.typing as npt
 from .. import _core
 from ..model import FloatArray, View
 from ..simulate import Response, SimulatedPhoto, Simulation, simulate
+from . import options
 
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
@@ -222,16 +222,9 @@ def summary(outcomes: Sequence[Outcome]) -> str:
     return "\n".join(rows)
 
 
-def _seeds(text: str) -> list[int]:
-    first, _, last = text.partition(":")
-    return list(range(int(first), int(last))) if last else list(range(int(first)))
-
-
 def main() -> None:
     """Prints both tables."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--scene", action="append", help="square, demo, facade, room; several times for several")
-    parser.add_argument("--seeds", default="6", help="how many, or FIRST:END, without END itself")
+    parser = options.parser(__doc__, "square, demo, facade, room", "6")
     parser.add_argument("--megapixels", type=float, action="append", help="of the photos; several times for several")
     parser.add_argument("--photos", type=int, help="of each scene; all unless given")
     parser.add_argument("--cache", type=Path, help="a folder that keeps the simulations with their truth")
@@ -239,7 +232,7 @@ def main() -> None:
     outcomes = []
     print(HEADER, flush=True)
     for outcome in run(
-        arguments.scene or ["square"], _seeds(arguments.seeds), arguments.megapixels or [1.5], arguments.photos,
+        arguments.scene or ["square"], arguments.seeds, arguments.megapixels or [1.5], arguments.photos,
         arguments.cache,
     ):  # fmt: skip
         print(line(outcome), flush=True)

@@ -6,8 +6,6 @@ use std::sync::atomic::{AtomicU32, AtomicU64};
 use rayon::prelude::*;
 
 use crate::error::{Error, Result};
-use crate::neighbours::Neighbour;
-use crate::render::Sample;
 
 /// A value whose bits may all be zero.
 ///
@@ -30,10 +28,6 @@ unsafe impl Zeroed for f64 {}
 unsafe impl Zeroed for i64 {}
 // SAFETY: all bits zero is the number 0.
 unsafe impl Zeroed for u32 {}
-// SAFETY: all bits zero is the first point, at no distance.
-unsafe impl Zeroed for Neighbour {}
-// SAFETY: all bits zero is an empty cell.
-unsafe impl Zeroed for Sample {}
 // SAFETY: an array is its elements side by side.
 unsafe impl<T: Zeroed, const N: usize> Zeroed for [T; N] {}
 

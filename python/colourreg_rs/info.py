@@ -90,7 +90,8 @@ def _view(view: View) -> dict[str, Any]:
     described["method"] = view.method
     described["control_points"] = sum(p.role == "control" for p in view.points)
     described["check_points"] = sum(p.role == "check" for p in view.points)
-    described["statistics"] = dict(view.statistics)
+    # The tests of every point and what belongs to them are for `evaluate`.
+    described["statistics"] = {k: v for k, v in view.statistics.items() if not isinstance(v, Mapping)}
     return described
 
 

@@ -18,7 +18,7 @@ use std::sync::OnceLock;
 use rayon::prelude::*;
 
 use crate::error::{Error, Result};
-use crate::memory::fresh;
+use crate::memory::{Zeroed, fresh};
 pub use approach::Approach;
 use grid::Grid;
 pub(crate) use order::along_a_curve;
@@ -38,6 +38,9 @@ pub struct Neighbour {
     /// Squared; infinite where there is no neighbour.
     pub distance2: f64,
 }
+
+// SAFETY: all bits zero is the first point, at no distance.
+unsafe impl Zeroed for Neighbour {}
 
 impl Neighbour {
     /// No neighbour.

@@ -5,6 +5,8 @@
 //! 4·10⁻⁶ of itself (0.1 mm at 30 m), for depths between 2⁻¹² and 2²⁰ of the cloud's unit; what lies beyond counts as
 //! lying there.
 
+use crate::memory::Zeroed;
+
 /// The largest inverse depth.
 const NEAREST: f32 = 4095.9;
 /// The smallest inverse depth, one step above 2⁻²⁰ so that nothing is coded as 0.
@@ -22,6 +24,9 @@ const DROPPED: u32 = 32 - 2 * PLACE - 16;
 #[repr(transparent)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default)]
 pub struct Sample(pub u32);
+
+// SAFETY: all bits zero is an empty cell.
+unsafe impl Zeroed for Sample {}
 
 impl Sample {
     /// From an inverse depth and a place in the pixel, right and down, in [0, 1]. The nearer of two is the larger; of

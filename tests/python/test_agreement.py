@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -97,3 +98,10 @@ def test_where_nothing_can_be_compared_nothing_is_claimed(rng):
     bare = PointCloud(scan.xyz)
     (first, second), _ = agreements(bare, views, photos)
     assert not first.tells and "intensity" in first.reason and second.tells
+
+
+def test_a_photo_does_not_confirm_itself():
+    scan, views, photos = scene()
+    twice = [replace(views[0], image=Path("same.jpg")), replace(views[0], name="again", image=Path("same.jpg"))]
+    found = agreements(scan, twice, [photos[0]] * 2)
+    assert [[c.title for c in comparisons] for comparisons in found] == [["cloud against photo"]] * 2

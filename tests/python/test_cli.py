@@ -117,6 +117,24 @@ def test_several_registrations_are_evaluated_together(job, tmp_path):
         assert what in done.stderr and str(wrong) in done.stderr
 
 
+def test_a_registration_given_twice_and_a_sigma_that_is_no_length_are_refused(job, tmp_path):
+    write_registration(tmp_path / "r.json", Registration((View("photo", job / "photo.png", CAMERA, POSE),)))
+    out = tmp_path / "coloured.laz"
+    for options, what in (
+        (["r.json", "./r.json"], "is given twice"),
+        (["r.json", "--max-sigma", "nan"], "ColourSigma"),
+    ):
+        done = colourreg("colourise", job / "scan.laz", *options, "--out", out, cwd=tmp_path)
+        assert done.returncode == 1 and done.stderr.count("\n") == 1 and what in done.stderr, done.stderr
+        assert not out.exists()
+
+
+def test_what_is_no_registration_is_called_so(job):
+    for name, what in (("scan.laz", "is no text"), ("points.csv", "is no JSON")):
+        done = colourreg("evaluate", name, cwd=job)
+        assert done.returncode == 1 and done.stderr.count("\n") == 1 and what in done.stderr, done.stderr
+
+
 def test_exchanged_axes_are_refused_however_well_one_wall_fits(job):
     """The mirror image of a wall is a wall: its points fit a view without a residual. The others tell."""
     points = read_points(job / "points.csv")

@@ -187,7 +187,7 @@ def _of_the_next_point(assessed: ViewAssessment) -> list[str]:
     if m is not None:
         middle = m.pixels[m.pixels.shape[0] // 2, m.pixels.shape[1] // 2]
         largest = float(np.nanmax(m.pixels))
-        if largest > UNEVEN * middle:
+        if assessed.view.points and largest > UNEVEN * middle:
             said.append(
                 f"The corners are worse than the middle ({largest:.2f} against {middle:.2f} px): the points do not "
                 "hold the borders of the photo."

@@ -412,8 +412,12 @@ def agreements(cloud: PointCloud, views: Sequence[View], photos: Sequence[Any]) 
             mine.append(cloud_against_photo(cloud, pyramids[i], view))
         else:
             mine.append(_silent("cloud against photo", view, "the cloud has no intensity to compare."))
-        mine += [
-            photo_against_photo(cloud, pyramids[i], view, photos[j], other) for j, other in enumerate(views) if j != i
+        # A photo agrees with itself, however wrong its view is.
+        others = [
+            (photos[j], other)
+            for j, other in enumerate(views)
+            if j != i and (view.image is None or other.image != view.image)
         ]
+        mine += [photo_against_photo(cloud, pyramids[i], view, photo, other) for photo, other in others]
         found.append(mine)
     return found

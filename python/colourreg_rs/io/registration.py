@@ -118,8 +118,14 @@ def _load(path: Path) -> Any:
     try:
         return json.loads(raw.decode("utf-8-sig"), parse_constant=no_constant, object_pairs_hook=unique)
     except UnicodeDecodeError as error:
-        raise FileError(path, "is no UTF-8 text", "save it as UTF-8") from error
+        raise FileError(
+            path,
+            "is no text, as registrations and cameras are",
+            "name a JSON file; one that was written in another encoding has to be saved as UTF-8",
+        ) from error
     except json.JSONDecodeError as error:
+        if not raw.lstrip(b"\xef\xbb\xbf \t\r\n").startswith((b"{", b"[")):
+            raise FileError(path, "is no JSON, as registrations and cameras are", "name such a file") from error
         problem = f"line {error.lineno}, column {error.colno}: {error.msg[:1].lower()}{error.msg[1:]}"
         raise FileError(path, problem, "correct the JSON") from error
     except (RecursionError, ValueError) as error:

@@ -46,7 +46,12 @@ def test_files_of_others_are_not_replaced(tmp_path, command, name):
 
 @pytest.mark.parametrize("arguments", [["simulate", "square", "--out", "."], ["reproduce", "table2", "--out", "."]])
 def test_ctrl_c_is_one_line_and_leaves_no_file(tmp_path, arguments):
-    with subprocess.Popen([*COMMAND, *arguments], cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
+    def listen() -> None:  # a shell that runs the tests in the background has told its children not to
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    with subprocess.Popen(
+        [*COMMAND, *arguments], cwd=tmp_path, stderr=subprocess.PIPE, text=True, preexec_fn=listen
+    ) as process:
         time.sleep(3)
         process.send_signal(signal.SIGINT)
         _, said = process.communicate(timeout=60)

@@ -632,6 +632,10 @@ class ResectionResult:
     @property
     def verdict(self) -> Verdict: ...
 
+def check_parameters(view: View, *, free: list[str] = ..., priors: list[tuple[str, float, float]] = ...) -> None:
+    """Raises InvalidInputError where :func:`resect` would whatever the points: a name that the camera does not have,
+    free parameters or priors (name, value, sigma) that contradict each other."""
+
 def resect(
     view: View,
     xyz: FloatArray,

@@ -48,6 +48,14 @@ class Method(StrEnum):
     sci = "sci"
 
 
+class Loss(StrEnum):
+    """A robust loss."""
+
+    huber = "huber"
+    cauchy = "cauchy"
+    tukey = "tukey"
+
+
 class Blend(StrEnum):
     """How the colours of several photos become one."""
 
@@ -274,9 +282,7 @@ def register(
     sigma_xyz: Annotated[
         float | None, typer.Option(help="Sigma of an object coordinate in metres, where the list has none; else 0.")
     ] = None,
-    loss: Annotated[
-        str | None, typer.Option(help="Robust loss instead of rejection and adjustment: huber, cauchy, tukey.")
-    ] = None,
+    loss: Annotated[Loss | None, typer.Option(help="Robust loss instead of rejection and adjustment.")] = None,
     distortion: Annotated[
         str, typer.Option(help="Distortion terms beside a DLT matrix, for example k1,k2,p1,p2.")
     ] = "",
@@ -300,7 +306,7 @@ def register(
         priors=tuple(prior or ()),
         sigma_xy=sigma,
         sigma_xyz=sigma_xyz,
-        loss=loss,
+        loss=loss.value if loss else None,
         distortion=tuple(name.strip() for name in distortion.split(",") if name.strip()),
         dlt_parameters=dlt_parameters,
         seed=seed,

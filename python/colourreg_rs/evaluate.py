@@ -170,8 +170,8 @@ def evaluate(registration: Registration, points: Sequence[ControlPoint] | None =
     """:func:`evaluate_view` for every view; given points belong to a registration of one view only."""
     if points and len(registration.views) > 1:
         raise InvalidInputError(
-            f"check points belong to one photo, the registration has {len(registration.views)} views; "
-            "evaluate each view in a file of its own"
+            f"control and check points belong to one photo, {len(registration.views)} views were given "
+            f"({', '.join(view.name for view in registration.views)}); evaluate the one that was measured alone"
         )
     return tuple(evaluate_view(view, points) for view in registration.views)
 

@@ -31,7 +31,7 @@ pub use p3p::{UpToFour, p3p, views_of_three};
 pub use parameters::{FreeSet, MAX_FREE, POSE_NAMES, Parameter};
 pub use priors::Prior;
 pub use ransac::RansacOptions;
-pub use resection::{Resection, ResectionOptions, Start, Status, resect, resect_robust};
+pub use resection::{Resection, ResectionOptions, Start, Status, check_parameters, resect, resect_robust};
 pub use residuals::Rms;
 pub use sampling::Random;
 pub use similarity::{SimilarityFit, SimilarityOptions, fit_similarity, iterate_similarity};

@@ -282,7 +282,7 @@ fn parameters_of(model: Model, name: &str) -> Result<Vec<Parameter>> {
                 POSE_NAMES.iter().chain(own).copied().collect::<Vec<_>>().join(" ")
             ),
         };
-        return Err(Error::invalid(format!("`{name}` cannot be free in a {} camera{remedy}", model.name())));
+        return Err(Error::invalid(format!("`{name}` cannot be free in a camera of model {}{remedy}", model.name())));
     }
     Ok(found)
 }
@@ -317,7 +317,7 @@ mod tests {
         let message = |model, names: &[&str]| FreeSet::parse(model, names).unwrap_err().to_string();
         assert!(message(Model::OpenCv, &["f", "fy"]).contains("`f` and `fy`"));
         assert!(message(Model::OpenCv, &["aspect", "fx"]).contains("`aspect` and `fx`"));
-        assert!(message(Model::OpenCv, &["k4"]).contains("`k4` cannot be free in a OPENCV camera"));
+        assert!(message(Model::OpenCv, &["k4"]).contains("`k4` cannot be free in a camera of model OPENCV"));
         assert!(message(Model::Pinhole, &["distortion"]).contains("give the camera as OPENCV"));
         assert!(message(Model::Equirectangular, &["f"]).contains("EQUIRECTANGULAR"));
         assert!(message(Model::OpenCv, &["skew"]).contains("DLT"));

@@ -4,7 +4,7 @@
 //! given view, from nothing (P3P on spread points), or, where blunders are expected, by RANSAC. The result carries its
 //! covariance, its residuals, and a verdict.
 
-use nalgebra::DMatrix;
+use nalgebra::{DMatrix, Vector3};
 
 use super::blunders::{Criterion, critical_f2, select};
 use super::collinearity::Collinearity;
@@ -13,7 +13,7 @@ use super::levenberg::{LeastSquares, Limits, Outcome, Stop};
 use super::loss::Loss;
 use super::observations::{Observations, Precision};
 use super::parameters::{FreeSet, POSE_NAMES};
-use super::priors::{Prior, Priors, resolve, set_values};
+use super::priors::{Prior, PriorTerm, Priors, resolve, set_values};
 use super::ransac::{self, RansacOptions};
 use super::residuals::Rms;
 use super::robust::{robust_scale, sandwich};
@@ -211,6 +211,47 @@ pub fn resect_robust(
     Ok(result)
 }
 
+/// What is estimated, what is held, and what is known of it before.
+struct Unknowns {
+    free: FreeSet,
+    terms: Vec<PriorTerm>,
+    held: Vec<(String, f64)>,
+    /// The view with the held values.
+    given: View,
+}
+
+/// Free parameters and priors against each other, in the frame whose origin lies at `origin`.
+fn unknowns(local: &View, free: &[String], priors: &[Prior], origin: &Vector3<f64>) -> Result<Unknowns> {
+    let model = local.camera.model();
+    let named = if free.is_empty() { FreeSet::pose(model) } else { FreeSet::parse(model, free)? };
+    let mut terms = Vec::new();
+    let mut held = Vec::new();
+    for prior in priors {
+        let resolved = resolve(prior, &named, local, origin)?;
+        if prior.sigma > 0.0 {
+            terms.push(resolved);
+        } else {
+            held.push((prior.name.clone(), resolved.value));
+        }
+    }
+    let places: Vec<usize> = held.iter().filter_map(|(name, _)| named.position(name)).collect();
+    let free = named.without(&places);
+    // Terms were placed in the set before the held ones left it.
+    let names = named.names();
+    for term in &mut terms {
+        term.place = free
+            .position(names[term.place])
+            .ok_or_else(|| Error::invalid(format!("`{}` has two priors, one of which holds it", names[term.place])))?;
+    }
+    let given = set_values(local, &held, &local.pose.rotation)?;
+    Ok(Unknowns { free, terms, held, given })
+}
+
+/// Whether these parameters can be free in this view, and these priors go with them: to be asked before points are read.
+pub fn check_parameters(view: &View, free: &[String], priors: &[Prior]) -> Result<()> {
+    unknowns(view, free, priors, &Vector3::zeros()).map(|_| ())
+}
+
 impl Task {
     fn new(view: &View, xyz: &[[f64; 3]], xy: &[[f64; 2]], options: &ResectionOptions) -> Result<Self> {
         let all = Observations::new(xyz, xy, options.precision.clone())?;
@@ -218,33 +259,12 @@ impl Task {
             return Err(Error::invalid(format!("{} points, but {} check marks", xyz.len(), options.check.len())));
         }
         let control = (0..xyz.len()).filter(|&i| !options.check.get(i).copied().unwrap_or(false)).collect();
-        let model = view.camera.model();
-        let named = if options.free.is_empty() { FreeSet::pose(model) } else { FreeSet::parse(model, &options.free)? };
-        let mut given = View {
+        let local = View {
             camera: view.camera,
             pose: Pose { rotation: view.pose.rotation, centre: view.pose.centre - all.origin },
         };
-        let mut terms = Vec::new();
-        let mut held = Vec::new();
-        for prior in &options.priors {
-            let resolved = resolve(prior, &named, &given, &all.origin)?;
-            if prior.sigma > 0.0 {
-                terms.push(resolved);
-            } else {
-                held.push((prior.name.clone(), resolved.value));
-            }
-        }
-        let places: Vec<usize> = held.iter().filter_map(|(name, _)| named.position(name)).collect();
-        let free = named.without(&places);
-        // Terms were placed in the set before the held ones left it.
-        let names = named.names();
-        for term in &mut terms {
-            term.place = free.position(names[term.place]).ok_or_else(|| {
-                Error::invalid(format!("`{}` has two priors, one of which holds it", names[term.place]))
-            })?;
-        }
+        let Unknowns { free, terms, held, given } = unknowns(&local, &options.free, &options.priors, &all.origin)?;
         let reference = view.pose.rotation;
-        given = set_values(&given, &held, &reference)?;
         let options = ResectionOptions {
             priors: held.into_iter().map(|(name, value)| Prior { name, value, sigma: 0.0 }).collect(),
             ..options.clone()

@@ -14,6 +14,10 @@ use crate::error::{Error, Result};
 /// The largest number of parameters that a model has.
 pub const MAX_PARAMS: usize = 12;
 
+/// Focal lengths that are taken for ones, in units of the longer side: a straight-line lens of 169° has the smallest, a
+/// telescope of 100 m the largest.
+const FOCAL: (f64, f64) = (0.05, 1e4);
+
 /// The camera models, with parameters in OpenCV's meaning.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Model {
@@ -138,6 +142,26 @@ impl Camera {
             Model::Equirectangular => Lens::Equirectangular,
         };
         Ok(Self { model, width, height, fx: p(0), fy: p(1), cx: p(2), cy: p(3), skew: 0.0, lens })
+    }
+
+    /// Refuses focal lengths that no camera has. Not a part of [`Camera::new`]: an iteration may pass through such values,
+    /// and a DLT matrix is of use without its parts having a meaning.
+    pub fn check_focal(&self) -> Result<()> {
+        let (size, names) = (f64::from(self.width.max(self.height)), self.model.parameters());
+        for (name, value) in names.iter().zip([self.fx, self.fy]) {
+            if !(FOCAL.0 * size..=FOCAL.1 * size).contains(&value) {
+                return Err(Error::invalid(format!(
+                    "{} camera: {name} = {value:?} for {} × {} pixels is no focal length in pixels (here between {} and \
+                     {}); one in mm is divided by the width of a pixel in mm",
+                    self.model.name(),
+                    self.width,
+                    self.height,
+                    FOCAL.0 * size,
+                    FOCAL.1 * size
+                )));
+            }
+        }
+        Ok(())
     }
 
     /// The same camera with a skew, as a decomposed DLT matrix has it.

@@ -235,6 +235,10 @@ impl PyResection {
 
 type PriorTuple = (String, f64, f64);
 
+fn named(priors: Vec<PriorTuple>) -> Vec<Prior> {
+    priors.into_iter().map(|(name, value, sigma)| Prior { name, value, sigma }).collect()
+}
+
 /// The arguments that both resections share.
 fn options(
     free: Vec<String>,
@@ -249,12 +253,18 @@ fn options(
     };
     Ok(ResectionOptions {
         free,
-        priors: priors.into_iter().map(|(name, value, sigma)| Prior { name, value, sigma }).collect(),
+        priors: named(priors),
         loss: Loss::from_name(loss)?,
         precision: precision(sigma_xy)?,
         start: Start::Auto,
         check,
     })
+}
+
+#[pyfunction]
+#[pyo3(signature = (view, *, free=Vec::new(), priors=Vec::new()))]
+fn check_parameters(view: &PyView, free: Vec<String>, priors: Vec<PriorTuple>) -> PyResult<()> {
+    Ok(estimation::check_parameters(&view.0, &free, &named(priors))?)
 }
 
 #[pyfunction]
@@ -321,6 +331,7 @@ pub(super) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_class::<PyWarning>()?;
     m.add_class::<PyVerdict>()?;
     m.add_class::<PyResection>()?;
+    m.add_function(wrap_pyfunction!(check_parameters, m)?)?;
     m.add_function(wrap_pyfunction!(resect, m)?)?;
     m.add_function(wrap_pyfunction!(resect_robust, m)?)?;
     m.add_function(wrap_pyfunction!(p3p, m)?)

@@ -25,6 +25,7 @@ impl PyView {
     ) -> PyResult<Self> {
         let params = Input::<f64>::new(params, "params", &[None])?;
         let camera = Camera::new(Model::from_name(model)?, width, height, params.values()?)?;
+        camera.check_focal()?;
         let rotation = matrix::<3, 3>(rotation, "rotation")?;
         let pose = Pose::from_rotation_translation(
             Matrix3::from_fn(|i, j| rotation[i][j]),

@@ -18,6 +18,7 @@ from colourreg_rs.io.registration import read_registration, write_camera, write_
 from colourreg_rs.register import RegisterOptions, register_photo
 
 CAMERA = Camera("OPENCV", 600, 400, {"fx": 500.0, "fy": 500.0, "cx": 299.5, "cy": 199.5, "k1": -0.04})
+REGISTER = ["register", "scan.laz", "photo.png", "--points", "points.csv", "--camera", "camera.json"]
 POSE = Pose.looking_at([500_000.0, 5_800_000.0, 102.0], [500_001.0, 5_800_010.0, 103.0])
 
 
@@ -45,6 +46,15 @@ def job(tmp_path_factory):
         for i, k in enumerate(inside)
     ]
     write_points(folder / "points.csv", points)
+    registered = register_photo(
+        folder / "scan.laz", folder / "photo.png", points=folder / "points.csv", camera=folder / "camera.json"
+    )
+    registered.save(folder / "registration.json")
+    registered.save(folder / "twin.json")
+    broken = json.loads((folder / "twin.json").read_text())
+    broken["views"][0]["camera"]["params"] |= {"fx": 8.0, "fy": 8.0}
+    (folder / "in_millimetres.json").write_text(json.dumps(broken))
+    write_cloud(folder / "nowhere.ply", PointCloud(np.full((5, 3), np.nan)))
     return folder
 
 
@@ -181,6 +191,16 @@ def test_info(job):
         ),
         (["register", "scan.laz", "photo.png", "--points", "camera.json", "--out", "x.json"], "camera.json", ""),
         (["register", "scan.laz", "photo.png", "--out", "x.json"], "", "--points"),
+        ([*REGISTER, "--out", "x.json", "--free", "pose,zoom"], "colourreg: `zoom`", "camera of model OPENCV"),
+        ([*REGISTER, "--out", "x.json", "--prior", "fx=500+-1"], "colourreg: `fx`", "is not free"),
+        ([*REGISTER, "--out", "x.json", "--method", "dlt", "--distortion", "k9"], "colourreg: a DLT", "'k9'"),
+        (["evaluate", "registration.json", "twin.json", "--points", "points.csv"], "belong to one photo", "2 views"),
+        (["evaluate", "registration.json", "--cloud", "nowhere.ply"], "nowhere.ply", "finite coordinates"),
+        (["sci", "nowhere.ply", "--view", "registration.json", "--out", "x"], "nowhere.ply", "finite coordinates"),
+        ([REGISTER[0], "nowhere.ply", *REGISTER[2:], "--out", "x.json"], "nowhere.ply", "finite coordinates"),
+        (["colourise", "nowhere.ply", "registration.json", "--out", "x.ply"], "nowhere.ply", "finite coordinates"),
+        (["backproject", "nowhere.ply", "registration.json", "--out", "x.ply"], "nowhere.ply", "finite coordinates"),
+        (["colourise", "scan.laz", "in_millimetres.json", "--out", "x.laz"], "in_millimetres.json", "no focal length"),
         (["colourise", "scan.laz", "camera.json", "--out", "x.laz"], "camera.json", "format"),
         (["colourise", "photo.png", "registration.json", "--out", "x.laz"], "photo.png", ""),
         (["colourise", "scan.laz", "registration.json", "--out", "scan.laz"], "scan.laz", "input"),
@@ -196,9 +216,6 @@ def test_bad_data_is_one_line_and_exit_code_1(job, arguments, file, problem):
     assert done.stderr.startswith("colourreg: ") and done.stderr.count("\n") == 1
     assert file in done.stderr and problem in done.stderr
     assert sorted(job.iterdir()) == before
-
-
-REGISTER = ["register", "scan.laz", "photo.png", "--points", "points.csv", "--camera", "camera.json"]
 
 
 @pytest.mark.parametrize(

@@ -80,6 +80,9 @@ H = "name,X,Y,Z,x,y\n"
         ("", ["is empty", "name,X,Y,Z,x,y"]),
         (H, ["no points"]),
         ("just a sentence\n", ["line 1", "names no columns"]),
+        ("T1,1,2,3,4,5\nT2,1,2,4,4,5\n", ["line 1 (T1,1,2,3,4,5)", "names no columns", "put a line name,X,Y,Z,x,y"]),
+        ("T1;1,5;2,5;3;4;5\n", ["line 1", "names no columns", "name;X;Y;Z;x;y"]),
+        (H + f"T1,1{'0' * 300},2,3,4,5\n", ["line 2, column X", "10000", "…", "too large"]),
         ("name,X,Y,Z,x\nT1,1,2,3,4\n", ["line 1", "column y is missing"]),
         ("name,x,y,z,u,v\nT1,1,2,3,4,5\n", ["line 1", "column X, Y, Z is missing"]),
         ("name,X,Y,Z,X,Y\nT1,1,2,3,4,5\n", ["line 1", "'X' is there twice", "photo coordinates"]),
@@ -124,7 +127,7 @@ def test_what_is_not_certain_is_refused_with_its_line(tmp_path, text, words):
         assert word in message
 
 
-finite = st.floats(allow_nan=False, allow_infinity=False)
+finite = st.floats(-1e12, 1e12, exclude_min=True, exclude_max=True)
 names = st.text(st.characters(blacklist_categories=("Cs", "Cc")), min_size=1, max_size=12).filter(
     lambda s: s == s.strip()
 )

@@ -115,8 +115,8 @@ def assess(registration: Registration, points: Sequence[ControlPoint] | None = N
     """Every view by its points and its covariance; given points belong to a registration of one view only."""
     if points and len(registration.views) > 1:
         raise InvalidInputError(
-            f"check points belong to one photo, the registration has {len(registration.views)} views; "
-            "evaluate each view in a file of its own"
+            f"control and check points belong to one photo, {len(registration.views)} views were given "
+            f"({', '.join(view.name for view in registration.views)}); evaluate the one that was measured alone"
         )
     return tuple(assess_view(view, points) for view in registration.views)
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from ..errors import FileError, InvalidInputError
 from ..evaluate import table
+from ..io.clouds import open_cloud
 from ..io.images import read_photo
 from ..io.registration import read_registration
 from ..model import ControlPoint, Registration, View
@@ -95,6 +96,8 @@ def assess_registration(
     progress("evaluating: reading the cloud", 0, steps)
     scan = cloud_before(cloud, list(views))
     if len(scan) == 0:
+        with open_cloud(cloud) as reader:
+            reader.extent()  # it may have no place at all
         raise FileError(cloud, "none of its points lies in any photo", "check the registration's frame and unit")
     found = []
     for i, a in enumerate(assessed):

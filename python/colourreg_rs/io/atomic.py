@@ -103,6 +103,8 @@ def refuse_target(path: Path, sources: tuple[str | Path, ...] = ()) -> None:
         if path.exists() and not path.is_file():
             what = "is a folder" if path.is_dir() else "is not a regular file"
             raise FileError(path, f"{what}, so nothing can be written there", "give the name of a file")
+        if path.exists() and not os.access(path, os.W_OK):
+            raise FileError(path, "is there and write-protected", "permit writing, or give the output another name")
         if not path.resolve().parent.is_dir():
             raise FileError(path, f"the folder {path.parent} does not exist", "create it first")
     except (OSError, ValueError, RuntimeError) as error:

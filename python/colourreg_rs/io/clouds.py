@@ -167,7 +167,11 @@ class CloudReader(ABC):
         return None
 
     def extent(self) -> Extent:
-        """Goes through all points once."""
+        """Goes through all points once.
+
+        Raises:
+            FileError: no point has coordinates.
+        """
         low, high, invalid = np.full(3, np.inf), np.full(3, -np.inf), 0
         for chunk in self.chunks(positions_only=True):
             xyz = chunk.xyz
@@ -177,6 +181,8 @@ class CloudReader(ABC):
                 xyz = xyz[valid]
             if len(xyz):
                 low, high = np.minimum(low, xyz.min(axis=0)), np.maximum(high, xyz.max(axis=0))
+        if invalid == self.n_points:
+            raise _without_coordinates(self.path, self.n_points)
         return Extent(low, high, invalid)
 
 
@@ -311,7 +317,11 @@ def output_format(path: Path, like: CloudReader) -> str:
 
 
 def read_cloud(path: str | Path) -> PointCloud:
-    """Reads a whole cloud into memory."""
+    """Reads a whole cloud into memory.
+
+    Raises:
+        FileError: as :func:`open_cloud`; or no point has coordinates.
+    """
     with open_cloud(path) as reader:
         n = reader.n_points
         xyz = np.empty((n, 3))
@@ -329,7 +339,13 @@ def read_cloud(path: str | Path) -> PointCloud:
                 rgb[part] = chunk.rgb  # type: ignore[assignment]  # there, as the reader says
             if normals is not None:
                 normals[part] = chunk.normals
+        if not np.isfinite(xyz).all(axis=1).any():
+            raise _without_coordinates(reader.path, n)
         return PointCloud(xyz, intensity, rgb, normals, reader.crs_wkt)
+
+
+def _without_coordinates(path: Path, n: int) -> FileError:
+    return FileError(path, f"none of its {n:,} points has finite coordinates", "export the cloud again")
 
 
 def write_cloud(path: str | Path, cloud: PointCloud, extra: Mapping[str, AnyArray] | None = None) -> None:

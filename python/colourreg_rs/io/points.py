@@ -23,6 +23,9 @@ OBJECT_SIGMAS = ("sX", "sY", "sZ")
 IMAGE_SIGMAS = ("sx", "sy")
 COLUMNS = (*REQUIRED, "role", *OBJECT_SIGMAS, *IMAGE_SIGMAS)
 
+#: What no coordinate in any unit, and no sigma, comes to.
+LARGEST = 1e12
+
 _LIMIT = 1 << 26
 _POINT = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _COMMA = re.compile(r"[+-]?(\d+,\d*|,\d+)([eE][+-]?\d+)?", re.ASCII)
@@ -94,6 +97,9 @@ def write_points(path: str | Path, points: Iterable[ControlPoint]) -> None:
 
 
 def _numbers(values: Iterable[float]) -> list[str]:
+    for value in values:
+        if not abs(value) < LARGEST:
+            raise InvalidInputError(f"{value:g} is too large for a coordinate: such a file could not be read")
     return [repr(float(v)) for v in values]
 
 
@@ -163,6 +169,10 @@ def _mend(separator: str) -> str:
 
 def _header(path: Path, line: int, cells: list[str], separator: str) -> list[str]:
     wanted = separator.join(REQUIRED)
+    if sum(bool(_POINT.fullmatch(c) or _COMMA.fullmatch(c)) for c in cells) >= 3:
+        shown = separator.join(cells)
+        shown = shown if len(shown) <= 60 else f"{shown[:57]}…"
+        raise FileError(path, f"line {line} ({shown}) names no columns", f"put a line {wanted} before it")
     twice = sorted({c for c in cells if cells.count(c) > 1})
     if twice:
         hint = " (X, Y, Z are object coordinates, x, y photo coordinates)" if set(twice) & {*"XYZxy"} else ""
@@ -218,7 +228,9 @@ class _Row:
                 )
             self.marks.setdefault(mark, (self.line, cell))
         value = float(cell.replace(",", "."))
-        if not np.isfinite(value):
+        if not abs(value) < LARGEST:
+            cell = cell if len(cell) < 30 else f"{cell[:20]}…{cell[-5:]}"
+            self.cells[column] = cell
             raise self.error(column, "is too large", "correct the number")
         return value
 

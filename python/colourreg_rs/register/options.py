@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
 from ..errors import InvalidInputError
+from ..model import DLT_DISTORTION_NAMES
+
+Method = Literal["dlt", "resection", "sci"]
+METHODS: tuple[Method, ...] = get_args(Method)
+LOSSES = ("squares", "huber", "cauchy", "tukey")
 
 
 @dataclass(frozen=True)
@@ -19,7 +24,7 @@ class RegisterOptions:
     in the photo is found from the residuals, and the coordinates in space are taken as exact.
     """
 
-    method: Literal["dlt", "resection", "sci"] = "resection"
+    method: Method = "resection"
     free: tuple[str, ...] | None = None
     priors: tuple[str, ...] = ()
     sigma_xy: float | None = None
@@ -30,6 +35,16 @@ class RegisterOptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise InvalidInputError(f"there is no method {self.method!r}: {', '.join(METHODS)}")
+        if self.loss is not None and self.loss not in LOSSES:
+            raise InvalidInputError(f"there is no loss {self.loss!r}: {', '.join(LOSSES)}")
+        unknown = [name for name in self.distortion if name not in DLT_DISTORTION_NAMES]
+        if unknown:
+            known = ", ".join(DLT_DISTORTION_NAMES)
+            raise InvalidInputError(f"a DLT has no distortion term {unknown[0]!r}: it takes any of {known}")
+        if self.dlt_parameters not in (11, 12):
+            raise InvalidInputError(f"a DLT of {self.dlt_parameters} parameters is not possible: 11 or 12")
         for name, value in (("sigma", self.sigma_xy), ("sigma-xyz", self.sigma_xyz)):
             if value is not None and not (np.isfinite(value) and value >= 0):
                 raise InvalidInputError(f"--{name} {value} is not possible: give a positive number")

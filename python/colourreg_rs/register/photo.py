@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from .. import _core
 from ..errors import DegenerateError, FileError, InvalidInputError, NotConvergedError
 from ..io.clouds import open_cloud
 from ..io.images import whole_photo_info
@@ -12,7 +13,7 @@ from ..io.points import read_points
 from ..model import Registration
 from .control import check_photo_coordinates, off_the_scan, outside_cloud
 from .dlt import by_dlt
-from .options import RegisterOptions
+from .options import RegisterOptions, parse_prior
 from .resection import by_resection
 from .result import RegisterResult
 from .sci import by_sci
@@ -58,12 +59,15 @@ def register_photo(
             f"method {options.method} needs control points: give a table with the columns name,X,Y,Z,x,y with --points"
         )
     points = Path(points)
+    start = starting_view(photo, info, Path(init) if init else None, Path(camera) if camera else None)
+    if options.method == "resection":  # what the points are not to blame for
+        priors = [parse_prior(text) for text in options.priors]
+        _core.check_parameters(start.view(photo).core, free=list(start.free(options)), priors=priors)
     control = read_points(points)
     with open_cloud(cloud) as reader:
         crs_wkt = reader.crs_wkt
         warnings = outside_cloud(control, reader, points)
     check_photo_coordinates(control, info, points)
-    start = starting_view(photo, info, Path(init) if init else None, Path(camera) if camera else None)
     try:
         if options.method == "dlt":
             result = by_dlt(photo, info, control, options)

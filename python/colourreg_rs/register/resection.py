@@ -26,9 +26,7 @@ def by_resection(
     photo: Path, control: Sequence[ControlPoint], start: StartingView, options: RegisterOptions
 ) -> RegisterResult:
     """Resection: robust against blunders and then adjusted, unless a robust loss was asked for instead."""
-    free = options.free or (("pose",) if start.calibrated else ("pose", "f"))
-    pose = start.pose or Pose(np.eye(3), np.zeros(3))
-    given = View(photo.stem, photo, start.camera, pose)
+    free, given = start.free(options), start.view(photo)
     priors = [parse_prior(text) for text in options.priors]
     sigmas = PointSigmas.of(control, options.sigma_xy, options.sigma_xyz)
     rough, sigmas = _approximate(given, control, sigmas, start, free, priors, options)

@@ -8,7 +8,7 @@ from ..errors import InvalidInputError, NotConvergedError
 from ..io.clouds import read_cloud
 from ..io.images import read_photo
 from ..matching.register_sci import SciOptions, register_sci
-from ..model import Registration, View
+from ..model import Registration
 from .options import RegisterOptions, parse_prior
 from .result import RegisterResult
 from .start import StartingView
@@ -19,12 +19,15 @@ def by_sci(cloud: Path, photo: Path, start: StartingView, options: RegisterOptio
     if start.pose is None:
         raise InvalidInputError("method sci starts from an approximate view: give a registration with --init")
     free = options.free or ("pose",)
-    given = View(photo.stem, photo, start.camera, start.pose)
+    given = start.view(photo)
     priors = tuple(parse_prior(text) for text in options.priors)
     points = read_cloud(cloud)
     found = register_sci(points, read_photo(photo).pixels, given, SciOptions(free=free, priors=priors))
     if not found.trusted:
-        raise NotConvergedError(f"no registration that can be trusted: {'; '.join(found.reasons)}")
+        raise NotConvergedError(
+            f"{photo}: no registration that can be trusted: {'; '.join(found.reasons)}; start from a nearer view "
+            "(--init), or measure control points (--method resection)"
+        )
     last = found.turns[-1]
     return RegisterResult(
         registration=Registration((found.view,), cloud, points.crs_wkt),

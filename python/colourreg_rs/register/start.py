@@ -5,10 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from ..errors import FileError
 from ..io.images import PhotoInfo
 from ..io.registration import read_camera, read_registration
-from ..model import Camera, Pose
+from ..model import Camera, Pose, View
+from .options import RegisterOptions
 
 #: The focal length, in units of the photo's long side, that a photo without EXIF is first taken to have.
 ORDINARY_FOCAL = 0.85
@@ -27,6 +30,14 @@ class StartingView:
     calibrated: bool
     origin: str
 
+    def view(self, photo: Path) -> View:
+        """The view of the photo before anything is estimated; without a pose it stands in the origin."""
+        return View(photo.stem, photo, self.camera, self.pose or Pose(np.eye(3), np.zeros(3)))
+
+    def free(self, options: RegisterOptions) -> tuple[str, ...]:
+        """What is estimated: what was asked for, else the pose, and the focal length where it is not known."""
+        return options.free or (("pose",) if self.calibrated else ("pose", "f"))
+
 
 def starting_view(photo: Path, info: PhotoInfo, init: Path | None, camera: Path | None) -> StartingView:
     """The camera that a calibration, ``init`` or EXIF tells, in this order, and the pose of ``init`` if there is one.
@@ -44,6 +55,8 @@ def starting_view(photo: Path, info: PhotoInfo, init: Path | None, camera: Path 
         if view.camera is None:
             raise FileError(init, f"view {view.name!r} is a DLT matrix", "start from a view with camera and pose")
         pose, known, calibrated, origin = view.pose, view.camera, True, f"camera from {init}"
+        if view.image is not None and not named:
+            origin += f", where it is that of {view.image.name}"
     if camera is not None:
         known, calibrated, origin = read_camera(camera), True, f"camera from {camera}"
     if known is not None:

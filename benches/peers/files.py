@@ -1,7 +1,9 @@
 """File to file: what does colouring cost beside merely rewriting the cloud with other colours?
 
 Limits: both read and write the same LAS or LAZ; the peer (laspy, chunked, both cores for LAZ) does no colouring at all.
-The cloud is a street of façades in point format 7; the photo has 24 megapixels. The page cache is warm for both.
+The cloud is a street of façades in point format 7; the photo has 24 megapixels. The page cache holds the
+input for both, and no output stands there before: one that is written over gives its memory back to whoever truncates
+it first, and not to whoever keeps it until the new one is whole.
 """
 
 from __future__ import annotations
@@ -62,18 +64,22 @@ def make_input(folder: Path, points: int, suffix: str) -> None:
 def colourreg(folder: str, suffix: str) -> float:
     from colourreg_rs.colourise import colourise_file
 
+    out = Path(folder, f"out{suffix}")
+    out.unlink(missing_ok=True)
     began = time.perf_counter()
-    colourise_file(Path(folder, f"scan{suffix}"), [Path(folder, "registration.json")], Path(folder, f"out{suffix}"))
+    colourise_file(Path(folder, f"scan{suffix}"), [Path(folder, "registration.json")], out)
     return time.perf_counter() - began
 
 
 def laspy_recolour(folder: str, suffix: str) -> float:
     import laspy
 
+    out = Path(folder, f"peer{suffix}")
+    out.unlink(missing_ok=True)
     began = time.perf_counter()
     with (
         laspy.open(Path(folder, f"scan{suffix}")) as reader,
-        laspy.open(Path(folder, f"peer{suffix}"), mode="w", header=reader.header) as writer,
+        laspy.open(out, mode="w", header=reader.header) as writer,
     ):
         for record in reader.chunk_iterator(CHUNK):
             record.red[:] = record.intensity

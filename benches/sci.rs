@@ -6,7 +6,7 @@
 #![allow(clippy::unwrap_used, missing_docs, reason = "a bench")]
 
 use colourreg::render::sci::{Hiding, draw, front};
-use colourreg::render::{Footprint, IndexBuffer, Splat};
+use colourreg::render::{Footprint, IndexBuffer, Splat, picture};
 use criterion::{Criterion, criterion_group, criterion_main};
 
 mod walls;
@@ -25,6 +25,10 @@ fn sci(c: &mut Criterion) {
             });
         });
     }
+    let values = vec![1.0; in_order.len()];
+    for (name, points) in [("in order", &in_order), ("shuffled", &mixed)] {
+        group.bench_function(format!("picture, {name}"), |b| b.iter(|| picture(&view, points, &values)));
+    }
     let buffer = IndexBuffer::new(view).unwrap();
     buffer.add(&in_order, 0).unwrap();
     let footprint = Footprint::new(None, None).unwrap();
@@ -32,7 +36,7 @@ fn sci(c: &mut Criterion) {
     group.bench_function("front of the buffer, surfaces hide", |b| {
         b.iter(|| front(&buffer, Hiding::Surfaces(&footprint)))
     });
-    let (values, splat) = (vec![1.0; in_order.len()], Splat::new(3).unwrap());
+    let splat = Splat::new(3).unwrap();
     group.bench_function("depth and values, points", |b| b.iter(|| draw(&buffer, Splat::POINT, &values)));
     group.bench_function("depth and values, splats of 3 x 3", |b| b.iter(|| draw(&buffer, splat, &values)));
     group.finish();

@@ -54,7 +54,10 @@ def by_numpy(xyz, intensity, footprint):
 def by_colourreg(xyz, intensity, footprint):
     from colourreg_rs import _core
 
-    buffer = _core.IndexBuffer(building.view(WIDTH, HEIGHT))
+    view = building.view(WIDTH, HEIGHT)
+    if footprint == 1:
+        return _core.sci_picture(view, xyz, intensity)
+    buffer = _core.IndexBuffer(view)
     buffer.add(xyz)
     return buffer.draw(intensity, splat=footprint)
 

@@ -155,6 +155,14 @@ def sci_front(
     drawn as a square of so many pixels, and what it hides is what it is drawn over. ``tolerance`` and ``max_gap`` as in
     :class:`DepthBuffer`."""
 
+def sci_picture(
+    view: View, xyz: FloatArray, values: npt.NDArray[np.float32]
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    """Depth (H, W) and value (H, W) of the nearest point in each pixel, NaN where there is none, of points (N, 3) that
+    have a value (N,) each: as an :class:`IndexBuffer` that is drawn, but in one go, which is faster and takes about as
+    long whatever the order of the points. On the way they are sorted, as many at once as there are pixels, 12 bytes
+    each. Raises InvalidInputError where sizes do not fit."""
+
 def sci_gather(
     view: View,
     index: npt.NDArray[np.int64],

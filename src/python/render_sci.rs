@@ -10,8 +10,9 @@ use crate::render::filling::{Filling, Samples, filled};
 use crate::render::intensity::{self, Exponents};
 use crate::render::resampling::{Scattered, resampled};
 use crate::render::sci::{self, Gathered, Hiding, Points};
-use crate::render::{Footprint, Splat};
+use crate::render::{Footprint, Splat, picture};
 
+type Picture<'py> = (Bound<'py, PyArray2<f32>>, Bound<'py, PyArray2<f32>>);
 type Front<'py> = (Bound<'py, PyArray2<i64>>, Bound<'py, PyArray2<f32>>, Bound<'py, PyArray2<f32>>);
 
 #[pyfunction]
@@ -76,6 +77,21 @@ fn sci_gather(
         cosine: cosine.values()?,
     };
     Ok(py.detach(|| sci::gather(&view.0, index, &station, &points, out))?)
+}
+
+#[pyfunction]
+fn sci_picture<'py>(
+    py: Python<'py>,
+    view: &PyView,
+    xyz: &Bound<'py, PyAny>,
+    values: &Bound<'py, PyAny>,
+) -> PyResult<Picture<'py>> {
+    let xyz = points3(xyz, "xyz")?;
+    let values = Input::<f32>::new(values, "values", &[None])?;
+    let (points, values) = (xyz.rows::<3>()?, values.values()?);
+    let (depth, value) = py.detach(|| picture(&view.0, points, values))?;
+    let shape = [view.0.camera.height as usize, view.0.camera.width as usize];
+    Ok((owned(py, depth, shape)?, owned(py, value, shape)?))
 }
 
 #[pyfunction]
@@ -174,6 +190,7 @@ fn stretch_by_rank<'py>(py: Python<'py>, values: &Bound<'py, PyAny>, top: u16) -
 
 pub(super) fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
     m.add_function(wrap_pyfunction!(sci_front, m)?)?;
+    m.add_function(wrap_pyfunction!(sci_picture, m)?)?;
     m.add_function(wrap_pyfunction!(sci_gather, m)?)?;
     m.add_function(wrap_pyfunction!(sci_fill, m)?)?;
     m.add_function(wrap_pyfunction!(sci_resample, m)?)?;

@@ -57,6 +57,12 @@ def test_an_index_buffer_is_that_of_numpy(rng):
     assert np.isnan(depth.ravel()[~found]).all()
     # A depth buffer keeps 22 bits of the depth.
     assert np.allclose(see(view, xyz).depth(), depth, rtol=5e-6, atol=0, equal_nan=True)
+    # In one go with the points' values, here their numbers: the same.
+    drawn, numbers = _core.sci_picture(view, xyz, np.arange(len(xyz), dtype=np.float32))
+    assert np.array_equal(drawn, depth, equal_nan=True)
+    assert np.array_equal(np.nan_to_num(numbers, nan=-1.0), index)
+    with pytest.raises(InvalidInputError, match="200000 points have 3 values"):
+        _core.sci_picture(view, xyz, np.zeros(3, np.float32))
 
 
 def test_chunks_their_order_and_threads_leave_no_trace(rng):

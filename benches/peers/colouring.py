@@ -1,10 +1,11 @@
 """How fast do 10 million points get their colours from 24 megapixels in memory: what hides what, then bilinear samples?
 
-Peers: the idiom that people paste together of NumPy and OpenCV (``projectPoints``, ``minimum.at``, tolerance of 1 %,
-``remap``), the same with a projection written in NumPy, and the same fused in a parallel numba kernel with a depth
-buffer for each thread. They hide only what falls into the same pixel; colourreg makes surfaces of the points, so that
-walls hide what shines through between their points, which is more work. Each in a process of its own on the same input,
-as scanned and shuffled. Limits: the photo is made up.
+Points are in the scan's frame, and all bring them into the camera's first. Peers: the idiom that people paste together
+of NumPy and OpenCV (``projectPoints``, ``minimum.at``, tolerance of 1 %, ``remap``), the same with pose and projection
+written in NumPy, and the same fused in a parallel numba kernel with a depth buffer for each thread. They hide only what
+falls into the same pixel; colourreg makes surfaces of the points, so that walls hide what shines through between their
+points, which is more work. Each in a process of its own on the same input, as scanned and shuffled. Limits: the photo
+is made up.
 
     python -m benches.peers.colouring [--points 10000000] [--repeats 3]
 """
@@ -58,11 +59,8 @@ def colourreg(points: str, order: str) -> float:
 
 
 def opencv_places(xyz: np.ndarray, params: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    import cv2
-
-    matrix = np.array([[params[0], 0, params[2]], [0, params[1], params[3]], [0, 0, 1]])
-    xy = cv2.projectPoints(xyz, np.zeros(3), np.zeros(3), matrix, params[4:])[0][:, 0]
-    return xy[:, 0], xy[:, 1], xyz[:, 2]
+    xy, depth = building.opencv_places(xyz, params)
+    return xy[:, 0], xy[:, 1], depth
 
 
 def numpy_opencv(points: str, order: str) -> float:
@@ -101,24 +99,15 @@ def _idiom(points: str, order: str, project: Callable[..., tuple[np.ndarray, np.
 def numba_fused(points: str, order: str) -> float:
     import numba
 
-    fx, fy, cx, cy, k1, k2, p1, p2, k3 = building.camera(WIDTH, HEIGHT).tolist()
-
-    @numba.njit(inline="always", fastmath=True)
-    def place(x: float, y: float, z: float) -> Any:
-        x, y = x / z, y / z
-        r2 = x * x + y * y
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        u = fx * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)) + cx
-        return u, fy * (y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y) + cy
+    place = building.numba_place(WIDTH, HEIGHT)
 
     @numba.njit(parallel=True, fastmath=True)
     def kernel(xyz: Any, image: Any, depths: Any, rgb: Any, seen: Any) -> None:
         n, workers = len(xyz), depths.shape[0]
         for w in numba.prange(workers):
             for i in range(w * n // workers, (w + 1) * n // workers):
-                z = xyz[i, 2]
+                u, v, z = place(xyz[i, 0], xyz[i, 1], xyz[i, 2])
                 if z > 0:
-                    u, v = place(xyz[i, 0], xyz[i, 1], z)
                     c, r = int(np.rint(u)), int(np.rint(v))
                     if 0 <= c < WIDTH and 0 <= r < HEIGHT and z < depths[w, r, c]:
                         depths[w, r, c] = z
@@ -127,10 +116,9 @@ def numba_fused(points: str, order: str) -> float:
                 for c in range(WIDTH):
                     depths[0, r, c] = min(depths[0, r, c], depths[w, r, c])
         for i in numba.prange(n):
-            z = xyz[i, 2]
+            u, v, z = place(xyz[i, 0], xyz[i, 1], xyz[i, 2])
             seen[i] = False
             if z > 0:
-                u, v = place(xyz[i, 0], xyz[i, 1], z)
                 c, r = int(np.rint(u)), int(np.rint(v))
                 if 0 <= c < WIDTH and 0 <= r < HEIGHT and z <= depths[0, r, c] * (1 + TOLERANCE):
                     seen[i] = True

@@ -1,9 +1,11 @@
 """How fast are 10 million points projected with distortion, pixels and depth in float64?
 
-Peers: NumPy as one writes it, OpenCV's projectPoints, pycolmap's camera, a parallel numba kernel (fresh and reused
-output). Each in a process of its own on the same input, best of three calls after a warm-up, since the first touch of
-fresh memory is not what is asked; all agree to 1e-6 px. Limits: the camera stands in the origin, so that OpenCV and
-pycolmap lose no digits; pycolmap gives no depth.
+All turn and shift the points into the camera's frame and give pixels and depths as arrays of their own. Peers: NumPy as
+one writes it, OpenCV's projectPoints with its rotation vector (the depths apart, as it gives none), pycolmap's pose and
+then its camera, a parallel numba kernel with all of it in its loop (fresh and reused output). The limit of the memory
+is what copying as many bytes takes, two threads of NumPy's, into a given array. Each in a process of its own on the
+same input, best of three calls after a warm-up, since the first touch of fresh memory is not what is asked; all agree
+to 1e-6 px. Limits: coordinates are small, so that nobody loses digits.
 
     python -m benches.peers.projection [--points 10000000] [--repeats 3]
 """
@@ -13,6 +15,7 @@ from __future__ import annotations
 import importlib.util
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -64,18 +67,14 @@ def numpy(points: str) -> float:
 
     def run(xyz: np.ndarray) -> Any:
         u, v, z = building.project(xyz, params)
-        return np.stack([u, v], 1), z
+        return np.stack([u, v], 1), z.copy()
 
     return _best(points, run)
 
 
 def opencv(points: str) -> float:
-    import cv2
-
-    p = building.camera(WIDTH, HEIGHT)
-    matrix = np.array([[p[0], 0, p[2]], [0, p[1], p[3]], [0, 0, 1]])
-    zero = np.zeros(3)
-    return _best(points, lambda xyz: (cv2.projectPoints(xyz, zero, zero, matrix, p[4:])[0][:, 0], xyz[:, 2].copy()))
+    params = building.camera(WIDTH, HEIGHT)
+    return _best(points, lambda xyz: building.opencv_places(xyz, params))
 
 
 def pycolmap(points: str) -> float:
@@ -83,24 +82,24 @@ def pycolmap(points: str) -> float:
 
     p = building.camera(WIDTH, HEIGHT)
     camera = colmap.Camera(model="FULL_OPENCV", width=WIDTH, height=HEIGHT, params=[*p, 0.0, 0.0, 0.0])
-    return _best(points, lambda xyz: (camera.img_from_cam(xyz), None))
+    cam_from_world = colmap.Rigid3d(colmap.Rotation3d(building.ROTATION), building.TRANSLATION)
+
+    def run(xyz: np.ndarray) -> Any:
+        in_camera = cam_from_world * xyz
+        return camera.img_from_cam(in_camera), in_camera[:, 2].copy()
+
+    return _best(points, run)
 
 
 def _kernel() -> Any:
     import numba
 
-    fx, fy, cx, cy, k1, k2, p1, p2, k3 = building.camera(WIDTH, HEIGHT).tolist()
+    place = building.numba_place(WIDTH, HEIGHT)
 
     @numba.njit(parallel=True, fastmath=True)
     def kernel(xyz: Any, xy: Any, depth: Any) -> None:
         for i in numba.prange(len(xyz)):
-            z = xyz[i, 2]
-            x, y = xyz[i, 0] / z, xyz[i, 1] / z
-            r2 = x * x + y * y
-            radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-            xy[i, 0] = fx * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)) + cx
-            xy[i, 1] = fy * (y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y) + cy
-            depth[i] = z
+            xy[i, 0], xy[i, 1], depth[i] = place(xyz[i, 0], xyz[i, 1], xyz[i, 2])
 
     return kernel
 
@@ -128,6 +127,20 @@ def numba_reused(points: str) -> float:
     return _best(points, run)
 
 
+def memory_limit(points: str) -> float:
+    """The same bytes, copied into a given array by two threads."""
+    source = building.cloud(int(points)).reshape(-1)
+    target = np.empty_like(source)
+    half = len(source) // 2
+    times = []
+    with ThreadPoolExecutor(2) as pool:
+        for _ in range(4):
+            began = time.perf_counter()
+            list(pool.map(np.copyto, (target[:half], target[half:]), (source[:half], source[half:])))
+            times.append(time.perf_counter() - began)
+    return min(times[1:])
+
+
 def main() -> None:
     options = parser(__doc__ or "").parse_args()
     contenders: dict[str, Callable[..., float]] = {
@@ -135,11 +148,12 @@ def main() -> None:
         "colourreg, into given arrays": colourreg_reused,
         "NumPy": numpy,
         "cv2.projectPoints": opencv,
-        "pycolmap, without depth": pycolmap,
+        "pycolmap": pycolmap,
         "numba, parallel": numba_fresh,
         "numba, into given arrays": numba_reused,
+        "copying as many bytes": memory_limit,
     }
-    for name, module in {"cv2.projectPoints": "cv2", "pycolmap, without depth": "pycolmap"}.items():
+    for name, module in {"cv2.projectPoints": "cv2", "pycolmap": "pycolmap"}.items():
         if importlib.util.find_spec(module) is None:
             print(f"{module} is not installed and left out")
             del contenders[name]

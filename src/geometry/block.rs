@@ -28,9 +28,84 @@ impl Block {
     }
 }
 
+impl Block {
+    /// The first results, as many as there is room for.
+    pub(super) fn put(&self, xy: &mut [[f64; 2]], depth: &mut [f64]) {
+        for (i, (xy, d)) in xy.iter_mut().zip(depth).enumerate() {
+            *xy = [self.x[i], self.y[i]];
+            *d = self.depth[i];
+        }
+    }
+
+    /// The same past the caches, which large results do not fit into anyway: otherwise what was there before is fetched
+    /// for nothing. To be followed by a fence. Of memory that does not lie as large arrays do nothing is asked.
+    #[cfg(target_arch = "x86_64")]
+    pub(super) fn put_past_caches(&self, xy: &mut [[f64; 2]], depth: &mut [f64]) {
+        use std::arch::x86_64::{_mm_loadu_pd, _mm_set_pd, _mm_stream_pd, _mm_stream_si64};
+        let aligned = |address: usize| address.is_multiple_of(16);
+        let n = depth.len();
+        if !aligned(xy.as_ptr().addr()) || n > LANES || n != xy.len() {
+            return self.put(xy, depth);
+        }
+        // SAFETY: every store goes to one element, or to two successive ones, of the slices, at an address that is a
+        // multiple of 16 where two numbers are stored; every load is within the block, as `n` is.
+        unsafe {
+            for (i, xy) in xy.iter_mut().enumerate() {
+                _mm_stream_pd(xy.as_mut_ptr(), _mm_set_pd(self.y[i], self.x[i]));
+            }
+            let out = depth.as_mut_ptr();
+            let one = |i: usize| _mm_stream_si64(out.add(i).cast(), self.depth[i].to_bits().cast_signed());
+            let first = usize::from(!aligned(out.addr())).min(n);
+            (0..first).for_each(one);
+            let pairs = (n - first) / 2;
+            for i in (first..).step_by(2).take(pairs) {
+                _mm_stream_pd(out.add(i), _mm_loadu_pd(self.depth.as_ptr().add(i)));
+            }
+            (first + 2 * pairs..n).for_each(one);
+        }
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+impl Block {
+    /// After it, others see what was put past the caches.
+    #[allow(unused_unsafe, reason = "newer compilers know that it is safe")]
+    pub(super) fn fence() {
+        // SAFETY: every processor of this kind has it.
+        unsafe { std::arch::x86_64::_mm_sfence() };
+    }
+}
+
 impl Default for Block {
     fn default() -> Self {
         Self::new()
+    }
+}
+
+/// The widest registers of the processor.
+#[cfg(target_arch = "x86_64")]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Registers {
+    /// Those that all processors of the kind have.
+    Any,
+    Avx2,
+    /// With the parts that all processors with such registers have had but the first.
+    Avx512,
+}
+
+#[cfg(target_arch = "x86_64")]
+impl Registers {
+    /// What this processor has.
+    #[inline]
+    pub fn here() -> Self {
+        use std::arch::is_x86_feature_detected as has;
+        if has!("avx512f") && has!("avx512vl") && has!("avx512dq") && has!("avx512bw") {
+            Self::Avx512
+        } else if has!("avx2") {
+            Self::Avx2
+        } else {
+            Self::Any
+        }
     }
 }
 
@@ -41,7 +116,7 @@ pub struct BlockProjector {
     rotation: [[f64; 3]; 3],
     centre: [f64; 3],
     #[cfg(target_arch = "x86_64")]
-    wide: bool,
+    registers: Registers,
 }
 
 impl BlockProjector {
@@ -52,18 +127,26 @@ impl BlockProjector {
             rotation: std::array::from_fn(|i| std::array::from_fn(|j| view.pose.rotation[(i, j)])),
             centre: view.pose.centre.into(),
             #[cfg(target_arch = "x86_64")]
-            wide: std::arch::is_x86_feature_detected!("avx2"),
+            registers: Registers::here(),
         }
     }
 
     /// Projects up to [`LANES`] points; what stands behind them in the block afterwards has no meaning.
     pub fn project(&self, points: &[[f64; 3]], block: &mut Block) {
         #[cfg(target_arch = "x86_64")]
-        if self.wide {
-            // SAFETY: the processor has the feature, as found out at birth.
-            unsafe { self.project_avx2(points, block) };
-            return;
+        match self.registers {
+            // SAFETY: the processor has the features, as found out at birth.
+            Registers::Avx512 => return unsafe { self.project_avx512(points, block) },
+            // SAFETY: as above.
+            Registers::Avx2 => return unsafe { self.project_avx2(points, block) },
+            Registers::Any => {}
         }
+        self.project_here(points, block);
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    unsafe fn project_avx512(&self, points: &[[f64; 3]], block: &mut Block) {
         self.project_here(points, block);
     }
 
@@ -146,6 +229,34 @@ impl BlockProjector {
             };
             (block.x[i], block.y[i]) = (x, y);
             block.depth[i] = if x.is_nan() { f64::NAN } else { depth };
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    #[cfg(target_arch = "x86_64")]
+    fn puts_the_same_past_the_caches_wherever_the_arrays_begin_and_end() {
+        let mut block = Block::new();
+        for i in 0..LANES {
+            (block.x[i], block.y[i], block.depth[i]) = (i as f64, -(i as f64), 0.5 + i as f64);
+        }
+        let mut room = vec![0.0_f64; 4 * LANES];
+        for (first, n) in [(0, LANES), (1, LANES), (2, 7), (3, 8), (1, 1), (0, 0)] {
+            room.fill(7.0);
+            let (xy, depth) = room.split_at_mut(2 * LANES + 6);
+            let xy = &mut xy[first..first + 2 * n].as_chunks_mut::<2>().0[..n];
+            block.put_past_caches(xy, &mut depth[first..first + n]);
+            Block::fence();
+            let (mut wanted_xy, mut wanted_depth) = (vec![[0.0; 2]; n], vec![0.0; n]);
+            block.put(&mut wanted_xy, &mut wanted_depth);
+            assert_eq!((&xy[..], &depth[first..first + n]), (&wanted_xy[..], &wanted_depth[..]));
+            let others = room.iter().filter(|&&v| v == 7.0).count();
+            let sevens = wanted_xy.as_flattened().iter().chain(&wanted_depth).filter(|&&v| v == 7.0).count();
+            assert_eq!(others - sevens, room.len() - 3 * n, "written beside the slices");
         }
     }
 }

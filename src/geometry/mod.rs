@@ -13,6 +13,8 @@ mod similarity;
 mod tangents;
 mod view;
 
+#[cfg(target_arch = "x86_64")]
+pub(crate) use block::Registers;
 pub use block::{Block, BlockProjector, LANES};
 pub use camera::{Camera, Depth, MAX_PARAMS, Model, Projection};
 pub use field::forward_field;

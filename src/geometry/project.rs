@@ -12,6 +12,9 @@ use crate::memory::fresh;
 
 /// Points per task of the scheduler.
 const TASK: usize = 32 * LANES;
+/// From this many points on results are larger than caches are.
+#[cfg(target_arch = "x86_64")]
+const MANY: usize = 1 << 20;
 
 /// World points to pixels and depths. What the camera cannot see is NaN in both.
 pub fn project(view: &View, xyz: &[[f64; 3]]) -> (Vec<[f64; 2]>, Vec<f64>) {
@@ -37,15 +40,23 @@ pub fn project_into(view: &View, xyz: &[[f64; 3]], xy: &mut [[f64; 2]], depth: &
 
 fn fill(view: &View, xyz: &[[f64; 3]], xy: &mut [[f64; 2]], depth: &mut [f64]) {
     let projector = BlockProjector::new(view);
+    #[cfg(target_arch = "x86_64")]
+    let many = xyz.len() >= MANY;
     xyz.par_chunks(TASK).zip(xy.par_chunks_mut(TASK)).zip(depth.par_chunks_mut(TASK)).for_each(
         |((points, xy), depth)| {
             let mut block = Block::new();
             for ((points, xy), depth) in points.chunks(LANES).zip(xy.chunks_mut(LANES)).zip(depth.chunks_mut(LANES)) {
                 projector.project(points, &mut block);
-                for (i, (xy, d)) in xy.iter_mut().zip(depth).enumerate() {
-                    *xy = [block.x[i], block.y[i]];
-                    *d = block.depth[i];
+                #[cfg(target_arch = "x86_64")]
+                if many {
+                    block.put_past_caches(xy, depth);
+                    continue;
                 }
+                block.put(xy, depth);
+            }
+            #[cfg(target_arch = "x86_64")]
+            if many {
+                Block::fence();
             }
         },
     );

@@ -11,6 +11,8 @@ use rayon::prelude::*;
 
 use super::sample::Sample;
 use crate::error::{Error, Result};
+#[cfg(target_arch = "x86_64")]
+use crate::geometry::Registers;
 use crate::geometry::{Block, BlockProjector, Frustum, LANES, Model, View};
 use crate::memory::{fresh, zeros};
 
@@ -151,6 +153,12 @@ impl Grid {
     }
 
     #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx512f,avx512vl,avx512dq,avx512bw")]
+    unsafe fn locate_avx512(&self, block: &Block, margin: usize, cells: &mut Located) {
+        self.locate_here(block, margin, cells);
+    }
+
+    #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2")]
     unsafe fn locate_avx2(&self, block: &Block, margin: usize, cells: &mut Located) {
         self.locate_here(block, margin, cells);
@@ -159,10 +167,12 @@ impl Grid {
     /// The cells of a block of projected points, as far as they lie in the photo widened by `margin`.
     pub fn locate(&self, block: &Block, margin: usize, cells: &mut Located) {
         #[cfg(target_arch = "x86_64")]
-        if std::arch::is_x86_feature_detected!("avx2") {
+        match Registers::here() {
+            // SAFETY: the processor has the features.
+            Registers::Avx512 => return unsafe { self.locate_avx512(block, margin, cells) },
             // SAFETY: the processor has the feature.
-            unsafe { self.locate_avx2(block, margin, cells) };
-            return;
+            Registers::Avx2 => return unsafe { self.locate_avx2(block, margin, cells) },
+            Registers::Any => {}
         }
         self.locate_here(block, margin, cells);
     }

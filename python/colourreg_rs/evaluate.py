@@ -166,13 +166,18 @@ def evaluate_view(view: View, points: Sequence[ControlPoint] | None = None) -> V
     )
 
 
+def refuse_points_of_several(views: Sequence[View], points: Sequence[ControlPoint] | None) -> None:
+    """Points are measured in one photo: raises InvalidInputError where they come with more views than one."""
+    if points and len(views) > 1:
+        raise InvalidInputError(
+            f"control and check points belong to one photo, {len(views)} views were given "
+            f"({', '.join(view.name for view in views)}); evaluate the one that was measured alone"
+        )
+
+
 def evaluate(registration: Registration, points: Sequence[ControlPoint] | None = None) -> tuple[ViewEvaluation, ...]:
     """:func:`evaluate_view` for every view; given points belong to a registration of one view only."""
-    if points and len(registration.views) > 1:
-        raise InvalidInputError(
-            f"control and check points belong to one photo, {len(registration.views)} views were given "
-            f"({', '.join(view.name for view in registration.views)}); evaluate the one that was measured alone"
-        )
+    refuse_points_of_several(registration.views, points)
     return tuple(evaluate_view(view, points) for view in registration.views)
 
 

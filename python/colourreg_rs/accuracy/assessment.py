@@ -17,7 +17,7 @@ from .. import _core
 from ..errors import DegenerateError, InvalidInputError
 from ..evaluate import ViewEvaluation, evaluate_view
 from ..matching.correspondences import pixels_per_radian
-from ..model import ControlPoint, FloatArray, Registration, View
+from ..model import ControlPoint, FloatArray, View
 from .view_adjustment import NOMINAL_SIGMA, PointSigmas, plain
 
 if TYPE_CHECKING:
@@ -109,16 +109,6 @@ class ViewAssessment:
             "agreement": [a.as_dict() for a in self.agreement],
             "notes": list(self.notes),
         }
-
-
-def assess(registration: Registration, points: Sequence[ControlPoint] | None = None) -> tuple[ViewAssessment, ...]:
-    """Every view by its points and its covariance; given points belong to a registration of one view only."""
-    if points and len(registration.views) > 1:
-        raise InvalidInputError(
-            f"control and check points belong to one photo, {len(registration.views)} views were given "
-            f"({', '.join(view.name for view in registration.views)}); evaluate the one that was measured alone"
-        )
-    return tuple(assess_view(view, points) for view in registration.views)
 
 
 def assess_view(view: View, points: Sequence[ControlPoint] | None = None) -> ViewAssessment:

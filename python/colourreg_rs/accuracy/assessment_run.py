@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import FileError, InvalidInputError
-from ..evaluate import table
+from ..evaluate import refuse_points_of_several, table
 from ..io.clouds import open_cloud
 from ..io.images import read_photo
 from ..io.registration import read_registration
@@ -19,7 +19,7 @@ from ..model import ControlPoint, Registration, View
 from ..photo_sizes import with_photo_sizes
 from ..progress import Progress, silent
 from .advice import advice, figure, headline, in_all_units
-from .assessment import CHECK_ALPHA, ViewAssessment, assess, at_depth, next_points_on
+from .assessment import CHECK_ALPHA, ViewAssessment, assess_view, at_depth, next_points_on
 
 
 def read_registrations(paths: Sequence[Path]) -> tuple[Registration, tuple[Path, ...]]:
@@ -68,10 +68,8 @@ def assess_registration(
     nothing at all to evaluate.
     """
     views = registration.views
-    try:
-        assessed = assess(registration, points)
-    except InvalidInputError as error:
-        raise FileError(files[0], str(error)) from error
+    refuse_points_of_several(views, points)
+    assessed = tuple(_assessed(view, file, points) for view, file in zip(views, files, strict=True))
     blind = [i for i, a in enumerate(assessed) if a.evaluation is None and a.view.covariance is None]
     if blind and cloud is None:
         raise FileError(
@@ -112,6 +110,13 @@ def assess_registration(
     compared = agreements(scan, views, photos)
     progress("evaluating: done", steps, steps)
     return tuple(replace(a, agreement=tuple(x)) for a, x in zip(found, compared, strict=True)), photos
+
+
+def _assessed(view: View, file: Path, points: Sequence[ControlPoint] | None) -> ViewAssessment:
+    try:
+        return assess_view(view, points)
+    except InvalidInputError as error:
+        raise FileError(file, str(error)) from error
 
 
 def _photo(path: Path, size: tuple[int, int] | None) -> Any:

@@ -48,11 +48,11 @@ class BackprojectOptions:
 
     def __post_init__(self) -> None:
         limits = {"extension": (0.0, 1000.0, "px"), "radius": (1.5, 32.0, "px")}
-        limits |= {"depth_sigma": (0.0, np.inf, "m"), "pixel_sigma": (0.0, np.inf, "px")}
+        limits |= {"depth_sigma": (0.0, 1000.0, "m"), "pixel_sigma": (0.0, 1000.0, "px")}
         for name, (least, most, unit) in limits.items():
             value = getattr(self, name)
             if not (np.isfinite(value) and least <= value <= most):
-                allowed = f"{least:g} to {most:g} {unit}" if np.isfinite(most) else f"at least {least:g} {unit}"
+                allowed = f"{least:g} to {most:g} {unit}"
                 raise InvalidInputError(f"{name.replace('_', ' ')} of {value:g} is not possible: {allowed}")
 
 

@@ -6,8 +6,6 @@ import re
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-import numpy as np
-
 from ..errors import InvalidInputError
 from ..model import DLT_DISTORTION_NAMES
 
@@ -45,9 +43,9 @@ class RegisterOptions:
             raise InvalidInputError(f"a DLT has no distortion term {unknown[0]!r}: it takes any of {known}")
         if self.dlt_parameters not in (11, 12):
             raise InvalidInputError(f"a DLT of {self.dlt_parameters} parameters is not possible: 11 or 12")
-        for name, value in (("sigma", self.sigma_xy), ("sigma-xyz", self.sigma_xyz)):
-            if value is not None and not (np.isfinite(value) and value >= 0):
-                raise InvalidInputError(f"--{name} {value} is not possible: give a positive number")
+        for name, value, most in (("sigma", self.sigma_xy, 1e4), ("sigma-xyz", self.sigma_xyz, 1e4)):
+            if value is not None and not 0 <= value <= most:
+                raise InvalidInputError(f"--{name} {value:g} is not possible: 0 to {most:g}")
         for text in self.priors:
             parse_prior(text)
 

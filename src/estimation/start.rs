@@ -24,6 +24,12 @@ const REFINED: usize = 4;
 /// A candidate whose cost after a few steps is this many times the best one's is given up.
 const HOPELESS: f64 = 30.0;
 
+/// The same before any step, where there are [`MANY`] points: residuals a hundred times those of the best start. P3P fits
+/// three points, so that a second view which fits all of them nearly as well has starts about as good as the first's.
+const NO_START: f64 = 1e4;
+/// See [`NO_START`].
+const MANY: usize = 10;
+
 /// Twice the log-likelihood ratio beyond which a candidate is ruled out.
 const RULED_OUT: f64 = 30.0;
 
@@ -70,26 +76,29 @@ pub(super) fn search(observations: &Observations, camera: &Camera, free: &FreeSe
     let triples = spread_triples(&judged, &corners);
     let size = f64::from(camera.width.max(camera.height));
     let cap = (0.5 * size / judged.precision.typical_sigma()).powi(2);
-    let mut found: Vec<Candidate> = Vec::new();
-    for camera in cameras_to_try(camera, free) {
+    let cameras = cameras_to_try(camera, free);
+    let mut found: Vec<(f64, &Camera, Pose)> = Vec::with_capacity(4 * TRIPLES * cameras.len());
+    for camera in &cameras {
         // Corners come again in many triples, and undoing a distortion is an iteration.
         let seen: Vec<Option<Vector3<f64>>> = corners.iter().map(|&i| camera.unproject(&judged.xy[i])).collect();
         for triple in &triples {
             let [Some(a), Some(b), Some(c)] = triple.map(|k| seen[k]) else { continue };
             for pose in p3p(&triple.map(|k| judged.xyz[corners[k]]), &[a, b, c]).iter() {
-                let view = View::new(camera, *pose);
-                found.push(Candidate { view, cost: capped_cost(&judged, &view, cap) });
+                found.push((capped_cost(&judged, &View::new(*camera, *pose), cap), camera, *pose));
             }
         }
     }
-    found.sort_by(|a, b| a.cost.total_cmp(&b.cost));
-    let mut distinct: Vec<Candidate> = Vec::new();
-    for c in found {
-        if distinct.len() == REFINED {
+    let mut order: Vec<usize> = (0..found.len()).collect();
+    order.sort_by(|&a, &b| found[a].0.total_cmp(&found[b].0));
+    let enough =
+        order.first().filter(|_| judged.len() >= MANY).map_or(f64::INFINITY, |&i| NO_START * found[i].0.max(1.0));
+    let mut distinct: Vec<(&Camera, &Pose)> = Vec::with_capacity(REFINED);
+    for (cost, camera, pose) in order.iter().map(|&i| &found[i]) {
+        if distinct.len() == REFINED || *cost > enough {
             break;
         }
-        if !distinct.iter().any(|d| alike(&d.view.pose, &c.view.pose, 0.05)) {
-            distinct.push(c);
+        if !distinct.iter().any(|(_, d)| alike(d, pose, 0.05)) {
+            distinct.push((camera, pose));
         }
     }
     let limits = Limits { iterations: 50, step: 1e-4, ..Limits::default() };
@@ -97,8 +106,8 @@ pub(super) fn search(observations: &Observations, camera: &Camera, free: &FreeSe
     let mut refined: Vec<Candidate> = Vec::new();
     // The pose first, so that a wrong focal length does not run away with it.
     let pose = FreeSet::pose(camera.model());
-    for c in distinct {
-        let Some(mut fitted) = fit_plainly(&judged, &pose, &c.view, &first_look) else { continue };
+    for (camera, start) in distinct {
+        let Some(mut fitted) = fit_plainly(&judged, &pose, &View::new(*camera, *start), &first_look) else { continue };
         let best = refined.iter().map(|r| r.cost).fold(f64::INFINITY, f64::min) * judged.len() as f64;
         if free.is_pose() && fitted.normal.cost > HOPELESS * best {
             continue;

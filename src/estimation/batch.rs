@@ -97,7 +97,40 @@ impl FlatView {
 
     #[inline(always)]
     fn squares_of<const RATIONAL: bool>(&self, batch: &Batch) -> Lane {
-        let mut out = [0.0; LANES];
+        let [dx, dy] = self.differences_of::<RATIONAL>(batch, f64::INFINITY);
+        std::array::from_fn(|i| dx[i] * dx[i] + dy[i] * dy[i])
+    }
+
+    /// Projected minus measured pixel of each point, px; NaN where not visible.
+    #[inline]
+    pub fn differences(&self, batch: &Batch) -> [Lane; 2] {
+        #[cfg(target_arch = "x86_64")]
+        if has_avx2() {
+            // SAFETY: the machine has AVX2.
+            return unsafe { self.differences_avx2(batch) };
+        }
+        self.differences_any(batch)
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2")]
+    fn differences_avx2(&self, batch: &Batch) -> [Lane; 2] {
+        self.differences_any(batch)
+    }
+
+    #[inline(always)]
+    fn differences_any(&self, batch: &Batch) -> [Lane; 2] {
+        if self.rational {
+            self.differences_of::<true>(batch, f64::NAN)
+        } else {
+            self.differences_of::<false>(batch, f64::NAN)
+        }
+    }
+
+    /// `unseen` is what points get that are not visible.
+    #[inline(always)]
+    fn differences_of<const RATIONAL: bool>(&self, batch: &Batch, unseen: f64) -> [Lane; 2] {
+        let mut out = [[0.0; LANES]; 2];
         for i in 0..LANES {
             let [px, py, pz] = self.camera_point(batch, i);
             let iz = 1.0 / pz;
@@ -107,7 +140,8 @@ impl FlatView {
             let dx = self.fx * xd + self.skew * yd + self.cx - batch.pixel[0][i];
             let dy = self.fy * yd + self.cy - batch.pixel[1][i];
             let visible = pz > 0.0 && r2 <= self.max_r2;
-            out[i] = if visible { dx * dx + dy * dy } else { f64::INFINITY };
+            out[0][i] = if visible { dx } else { unseen };
+            out[1][i] = if visible { dy } else { unseen };
         }
         out
     }

@@ -3,6 +3,7 @@
 use nalgebra::DMatrix;
 use rayon::prelude::*;
 
+use super::batch::{FlatView, LANES};
 use super::collinearity::Collinearity;
 use super::levenberg::{Limits, Outcome, minimise};
 use super::loss::Loss;
@@ -96,6 +97,15 @@ fn undetermined(names: &[&str], value: f64) -> Error {
 
 /// Residuals projected − measured of all points, pixels; NaN where a point is not visible.
 pub(super) fn residuals(observations: &Observations, view: &View) -> Vec<[f64; 2]> {
+    if let Some(flat) = FlatView::new(view) {
+        let mut all = vec![[0.0; 2]; observations.len()];
+        let chunks = all.par_chunks_mut(LANES).zip(observations.batches()).with_min_len(4096 / LANES);
+        chunks.for_each(|(out, batch)| {
+            let [dx, dy] = flat.differences(batch);
+            out.iter_mut().enumerate().for_each(|(i, v)| *v = [dx[i], dy[i]]);
+        });
+        return all;
+    }
     let one =
         |p: &[f64; 3], q: &[f64; 2]| view.project(p).map_or([f64::NAN; 2], |(xy, _)| [xy[0] - q[0], xy[1] - q[1]]);
     observations.xyz.par_iter().zip(&observations.xy).with_min_len(4096).map(|(p, q)| one(p, q)).collect()

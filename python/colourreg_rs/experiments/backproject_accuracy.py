@@ -41,14 +41,15 @@ EXTENSION = 8.0
 
 @dataclass(frozen=True)
 class Outcome:
-    """Of one photo and one origin: how many points, what part is wrong and goes on, and the parts of the errors within
-    one, two and three sigmas."""
+    """Of one photo and one origin: how many points, what part is wrong, of these unseen by the scanner, what part goes
+    on, and the parts of the errors within one, two and three sigmas."""
 
     scene: str
     seed: int
     origin: Origin
     points: int
     wrong: float
+    unseen: float
     goes_on: float
     within: tuple[float, float, float]
 
@@ -81,6 +82,26 @@ def wrong(simulation: Simulation, result: BackProjection, true: Truth) -> npt.ND
     return np.asarray((off > 5 * result.sigma[:, 0]) & (off > 0.02))
 
 
+#: What may stand before a place that the scanner sees, metres: rounding of the place.
+NEARLY = 1e-3
+
+
+def unseen(simulation: Simulation, pixels: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+    """(N,): whether none of a pixel's nine rays ends where the scanner sees. It sees no glass and no sky."""
+    eye, scene = simulation.photos[0].view.core, simulation.scene
+    stations = [scene.frame.to_scene(np.array(station)) for station in simulation.stations]
+    seen = np.zeros(len(pixels), dtype=np.bool_)
+    for shift in np.ndindex(3, 3):
+        rays = _core.unproject(eye, pixels + (np.array(shift) - 1) / 2)
+        hits = scene.cast(eye.centre, rays)
+        solid = np.flatnonzero(np.isfinite(hits.distance))
+        solid = solid[~scene.glass[hits.primitive[solid]]]
+        places = scene.frame.to_scene(eye.centre + rays[solid] * hits.distance[solid, None])
+        for station in stations:
+            seen[solid] |= scene.core.sees(station, np.ascontiguousarray(places), NEARLY)
+    return ~seen
+
+
 def measure(simulation: Simulation, extension: float = EXTENSION) -> list[Outcome]:
     """Back-projects the first photo, and compares."""
     view = simulation.photos[0].view
@@ -93,6 +114,8 @@ def measure(simulation: Simulation, extension: float = EXTENSION) -> list[Outcom
     # Noise decides which points are on one surface, so that a few pixels have a point in one of both alone.
     true_of_written = true if np.array_equal(written.pixels, result.pixels) else truth(simulation, written.pixels)
     bad = wrong(simulation, written, true_of_written)
+    hidden = np.zeros(len(bad), dtype=np.bool_)
+    hidden[bad] = unseen(simulation, written.pixels[bad])
     whole = (true.primitive == true.primitive[4]).all(axis=0) & (true.primitive[4] >= 0)
     row, column = np.nonzero(sci.measured)
     measured = np.stack([column, row], axis=1).astype(np.float64)
@@ -112,6 +135,7 @@ def measure(simulation: Simulation, extension: float = EXTENSION) -> list[Outcom
                 origin,
                 int((written.origin == origin).sum()),
                 _share(bad[written.origin == origin]),
+                _share(hidden[bad & (written.origin == origin)]),
                 _share(same[mine]),
                 (within[0], within[1], within[2]),
             )
@@ -132,8 +156,8 @@ def run(scenes: Sequence[str], seeds: Sequence[int], extension: float = EXTENSIO
 
 
 HEADER = (
-    "| scene   | seed | origin       |  points | wrong, % | goes on, % | 1, 2, 3 sigma, %   |\n"
-    "| ------- | ---: | ------------ | ------: | -------: | ---------: | -----------------: |"
+    "| scene   | seed | origin       |  points | wrong, % | unseen, % | goes on, % | 1, 2, 3 sigma, %   |\n"
+    "| ------- | ---: | ------------ | ------: | -------: | --------: | ---------: | -----------------: |"
 )
 
 
@@ -142,8 +166,8 @@ def line(o: Outcome) -> str:
     within = ", ".join(f"{100 * share:.1f}" for share in o.within)
     goes_on = f"{100 * o.goes_on:10.1f}" if o.origin == Origin.EXTENDED else " " * 10
     return (
-        f"| {o.scene:7} | {o.seed:4} | {o.origin.name.lower():12} | {o.points:7} | {100 * o.wrong:8.3f} | {goes_on} | "
-        f"{within:>18} |"
+        f"| {o.scene:7} | {o.seed:4} | {o.origin.name.lower():12} | {o.points:7} | {100 * o.wrong:8.3f} | "
+        f"{100 * o.unseen:9.1f} | {goes_on} | {within:>18} |"
     )
 
 

@@ -18,7 +18,7 @@ use rayon::prelude::*;
 
 use super::error_map::across_the_ray;
 use super::scanner::ScannerModel;
-use super::sigma_blocks::{BLOCK, fill_block, is_direction};
+use super::sigma_blocks::{BLOCK, Room, fill_block, is_direction};
 use super::sigma_tables::{Cell, Face, make_faces};
 use super::view_covariance::ViewCovariance;
 use crate::error::{Error, Result};
@@ -146,12 +146,12 @@ impl SurfaceSigma {
         }
         let faces = self.faces();
         out.par_chunks_mut(BLOCKS * BLOCK).enumerate().for_each(|(task, out)| {
-            let mut first = task * BLOCKS * BLOCK;
+            let (mut first, mut room) = (task * BLOCKS * BLOCK, Room::new());
             for out in out.chunks_mut(BLOCK) {
                 let here = first..first + out.len();
                 first = here.end;
                 let normals = slopes.normals.map(|n| &n[here.clone()]);
-                fill_block(self, faces, &xyz[here], Slopes { normals, ..slopes }, out);
+                fill_block(self, faces, &mut room, &xyz[here], Slopes { normals, ..slopes }, out);
             }
         });
         Ok(())
@@ -179,29 +179,53 @@ impl SurfaceSigma {
         let faces = self.faces();
         out.par_chunks_mut(BLOCKS * BLOCK).enumerate().for_each(|(task, out)| {
             let first = task * BLOCKS * BLOCK;
-            let mut mine = [0usize; BLOCK];
-            let (mut points, mut turned, mut found) = ([[0.0; 3]; BLOCK], [[0.0; 3]; BLOCK], [0.0f32; BLOCK]);
-            let mut at = 0;
-            while at < out.len() {
-                let mut n = 0;
-                while n < BLOCK && at < out.len() {
-                    if source[first + at] == number {
-                        (mine[n], points[n]) = (at, xyz[first + at]);
-                        if let Some(normals) = slopes.normals {
-                            turned[n] = normals[first + at];
-                        }
-                        n += 1;
-                    }
-                    at += 1;
+            let mut room = Room::new();
+            let mut fill = |xyz: &[[f64; 3]], normals: Option<&[[f64; 3]]>, out: &mut [f32]| {
+                fill_block(self, faces, &mut room, xyz, Slopes { normals, ..slopes }, out);
+                out.iter_mut().for_each(|value| *value = stored(*value));
+            };
+            // Of blocks that are the view's in part points are kept until they fill one.
+            let (mut kept, mut points, mut turned) = ([0usize; BLOCK], [[0.0; 3]; BLOCK], [[0.0; 3]; BLOCK]);
+            let mut n = 0;
+            for start in (0..out.len()).step_by(BLOCK) {
+                let end = out.len().min(start + BLOCK);
+                let here = first + start..first + end;
+                let mine = source[here.clone()].iter().filter(|&&source| source == number).count();
+                if mine == here.len() {
+                    fill(&xyz[here.clone()], slopes.normals.map(|normals| &normals[here]), &mut out[start..end]);
+                    continue;
                 }
-                let normals = slopes.normals.map(|_| &turned[..n]);
-                fill_block(self, faces, &points[..n], Slopes { normals, ..slopes }, &mut found[..n]);
-                for (place, value) in mine[..n].iter().zip(&found) {
-                    out[*place] = stored(*value);
+                for at in (start..end).filter(|at| mine > 0 && source[first + at] == number) {
+                    (kept[n], points[n]) = (at, xyz[first + at]);
+                    if let Some(normals) = slopes.normals {
+                        turned[n] = normals[first + at];
+                    }
+                    n += 1;
+                    if n == BLOCK {
+                        scatter(&mut fill, &kept, &points, slopes.normals.map(|_| &turned[..]), out);
+                        n = 0;
+                    }
                 }
             }
+            scatter(&mut fill, &kept[..n], &points[..n], slopes.normals.map(|_| &turned[..n]), out);
         });
         Ok(())
+    }
+}
+
+/// The figures of points that do not stand side by side.
+fn scatter(
+    fill: &mut impl FnMut(&[[f64; 3]], Option<&[[f64; 3]]>, &mut [f32]),
+    places: &[usize],
+    points: &[[f64; 3]],
+    normals: Option<&[[f64; 3]]>,
+    out: &mut [f32],
+) {
+    let mut found = [0.0; BLOCK];
+    let found = &mut found[..places.len()];
+    fill(points, normals, found);
+    for (place, value) in places.iter().zip(found) {
+        out[*place] = *value;
     }
 }
 

@@ -2,10 +2,12 @@
 //! that the compiler turns into vector instructions. Single precision suffices behind the difference to the centre.
 
 use super::propagation::{MIN_COSINE, ObjectNoise, Slopes, SurfaceSigma};
-use super::sigma_tables::{Cell, Face, Node, weights};
+use super::sigma_tables::{Cell, Face, weights};
 
 /// Points per block: all steps' arrays stay in the innermost cache.
 pub(super) const BLOCK: usize = 128;
+/// Points whose coordinates fill whole vectors.
+const FOUR: usize = 4;
 
 /// One coordinate of every point, side by side.
 type Lane = [f32; BLOCK];
@@ -19,26 +21,115 @@ struct Station {
     sigmas: [f32; 3],
 }
 
-/// One sigma per axis on the surface for up to [`BLOCK`] points.
-pub(super) fn fill_block(sigma: &SurfaceSigma, faces: &[Face], xyz: &[[f64; 3]], slopes: Slopes<'_>, out: &mut [f32]) {
+/// Room for the steps, of one block after the other. What stands behind the last point of a block is of an earlier one, and
+/// nothing is made of it.
+pub(super) struct Room {
+    /// From the projection centre, world frame, point by point.
+    arm: [[f32; 3]; BLOCK],
+    /// In the camera frame, then in that of the face.
+    ray: [Lane; 3],
+    normal: [Lane; 3],
+    beam: [Lane; 3],
+    up: [Lane; 3],
+    face: [u8; BLOCK],
+    /// (X, Y)/Z and 1/Z.
+    u: Lane,
+    v: Lane,
+    w: Lane,
+    /// Above the plane of the tables' parabola.
+    height: Lane,
+    /// Where the planes of the surface are.
+    cell: [u32; BLOCK],
+    places: Places,
+    /// What the tables say.
+    part: [[f32; 4]; BLOCK],
+    /// n / (n · D) with the ray D = (u, v, 1)
+    m: [Lane; 3],
+    variance: Lane,
+}
+
+impl Room {
+    pub fn new() -> Self {
+        let (lane, lanes) = ([0.0; BLOCK], [[0.0; BLOCK]; 3]);
+        Self {
+            arm: [[0.0; 3]; BLOCK],
+            ray: lanes,
+            normal: lanes,
+            beam: lanes,
+            up: lanes,
+            face: [0; BLOCK],
+            u: lane,
+            v: lane,
+            w: lane,
+            height: lane,
+            cell: [0; BLOCK],
+            places: Places::new(),
+            part: [[0.0; 4]; BLOCK],
+            m: lanes,
+            variance: lane,
+        }
+    }
+}
+
+/// One sigma per axis on the surface for up to [`BLOCK`] points. The room is for this sigma alone.
+pub(super) fn fill_block(
+    sigma: &SurfaceSigma,
+    faces: &[Face],
+    room: &mut Room,
+    xyz: &[[f64; 3]],
+    slopes: Slopes<'_>,
+    out: &mut [f32],
+) {
     #[cfg(target_arch = "x86_64")]
     if std::arch::is_x86_feature_detected!("avx2") {
         // SAFETY: the processor has the instructions that the function is compiled for.
-        unsafe { fill_block_avx2(sigma, faces, xyz, slopes, out) };
+        unsafe { fill_block_avx2(sigma, faces, room, xyz, slopes, out) };
         return;
     }
-    fill_block_anywhere(sigma, faces, xyz, slopes, out);
+    fill_block_here(sigma, faces, room, xyz, slopes, out);
 }
 
 #[cfg(target_arch = "x86_64")]
 #[target_feature(enable = "avx2")]
-fn fill_block_avx2(sigma: &SurfaceSigma, faces: &[Face], xyz: &[[f64; 3]], slopes: Slopes<'_>, out: &mut [f32]) {
-    fill_block_anywhere(sigma, faces, xyz, slopes, out);
+fn fill_block_avx2(
+    sigma: &SurfaceSigma,
+    faces: &[Face],
+    room: &mut Room,
+    xyz: &[[f64; 3]],
+    slopes: Slopes<'_>,
+    out: &mut [f32],
+) {
+    fill_block_here(sigma, faces, room, xyz, slopes, out);
 }
 
 #[inline(always)]
-fn fill_block_anywhere(sigma: &SurfaceSigma, faces: &[Face], xyz: &[[f64; 3]], slopes: Slopes<'_>, out: &mut [f32]) {
+fn fill_block_here(
+    sigma: &SurfaceSigma,
+    faces: &[Face],
+    room: &mut Room,
+    xyz: &[[f64; 3]],
+    slopes: Slopes<'_>,
+    out: &mut [f32],
+) {
+    match faces {
+        [_] => fill_block_on::<false>(sigma, faces, room, xyz, slopes, out),
+        _ => fill_block_on::<true>(sigma, faces, room, xyz, slopes, out),
+    }
+}
+
+/// On one face, or several.
+#[inline(always)]
+fn fill_block_on<const SEVERAL: bool>(
+    sigma: &SurfaceSigma,
+    faces: &[Face],
+    room: &mut Room,
+    xyz: &[[f64; 3]],
+    slopes: Slopes<'_>,
+    out: &mut [f32],
+) {
     let n = xyz.len().min(out.len()).min(BLOCK);
+    let Some(only) = faces.first() else { return out[..n].fill(f32::NAN) };
+    let Room { arm, ray, normal, beam, up, face, u, v, w, height, cell, places, part, m, variance } = room;
     let pose = &sigma.view.pose;
     let rotation: [[f32; 3]; 3] = std::array::from_fn(|i| std::array::from_fn(|k| pose.rotation[(i, k)] as f32));
     let turn = |d: [f32; 3]| -> [f32; 3] {
@@ -46,39 +137,28 @@ fn fill_block_anywhere(sigma: &SurfaceSigma, faces: &[Face], xyz: &[[f64; 3]], s
     };
 
     // Into the camera frame; the difference is formed in double precision.
-    let mut ray: [Lane; 3] = [[0.0; BLOCK]; 3];
-    for (i, p) in xyz[..n].iter().enumerate() {
-        let d = [0, 1, 2].map(|a| (p[a] - pose.centre[a]) as f32);
-        let q = turn(d);
-        for a in 0..3 {
-            ray[a][i] = q[a];
+    let centre: [f64; 3 * FOUR] = std::array::from_fn(|k| pose.centre[k % 3]);
+    let (fours, rest) = xyz[..n].as_chunks::<FOUR>();
+    for (points, arms) in fours.iter().zip(arm.as_chunks_mut::<FOUR>().0) {
+        let (points, arms) = (points.as_flattened(), arms.as_flattened_mut());
+        for k in 0..3 * FOUR {
+            arms[k] = (points[k] - centre[k]) as f32;
         }
     }
-    let mut normal: [Lane; 3] = [[0.0; BLOCK]; 3];
+    for (p, arm) in rest.iter().zip(&mut arm[n - rest.len()..]) {
+        *arm = [0, 1, 2].map(|a| (p[a] - pose.centre[a]) as f32);
+    }
+    for i in 0..BLOCK {
+        let q = turn(arm[i]);
+        (ray[0][i], ray[1][i], ray[2][i]) = (q[0], q[1], q[2]);
+    }
     if let Some(normals) = slopes.normals {
         for (i, p) in normals[..n].iter().enumerate() {
             let q = turn(p.map(|x| x as f32));
-            for a in 0..3 {
-                normal[a][i] = q[a];
-            }
+            (normal[0][i], normal[1][i], normal[2][i]) = (q[0], q[1], q[2]);
         }
-    }
-    if let Some(planes) = slopes.planes {
-        // All places first: the memory has time to bring what lies in them.
-        let mut cells = [None; BLOCK];
-        for i in 0..n {
-            cells[i] = planes.locate(pick(&ray, i));
-        }
-        for i in 0..n {
-            if !is_direction(pick(&normal, i))
-                && let Some(cell) = cells[i]
-                && let Some(found) = planes.normal_in(cell, pick(&ray, i))
-            {
-                for a in 0..3 {
-                    normal[a][i] = found[a];
-                }
-            }
-        }
+    } else {
+        *normal = [[0.0; BLOCK]; 3];
     }
     let station = match sigma.object {
         ObjectNoise::Isotropic(_) => None,
@@ -88,8 +168,6 @@ fn fill_block_anywhere(sigma: &SurfaceSigma, faces: &[Face], xyz: &[[f64; 3]], s
             sigmas: [s.sigma_range as f32, s.sigma_horizontal as f32, s.sigma_vertical as f32],
         }),
     };
-    let mut beam: [Lane; 3] = [[0.0; BLOCK]; 3];
-    let mut up: [Lane; 3] = [[0.0; BLOCK]; 3];
     if let Some(station) = &station {
         for a in 0..3 {
             for i in 0..n {
@@ -100,8 +178,7 @@ fn fill_block_anywhere(sigma: &SurfaceSigma, faces: &[Face], xyz: &[[f64; 3]], s
     }
 
     // Onto the faces: axes are renamed so that the third is the depth.
-    let mut face = [0u8; BLOCK];
-    if faces.len() > 1 {
+    if SEVERAL {
         for i in 0..n {
             let size = [ray[0][i].abs(), ray[1][i].abs(), ray[2][i].abs()];
             let k = if size[0] >= size[1] && size[0] >= size[2] {
@@ -114,51 +191,66 @@ fn fill_block_anywhere(sigma: &SurfaceSigma, faces: &[Face], xyz: &[[f64; 3]], s
             let negative = ray[k][i] < 0.0;
             face[i] = (2 * k + usize::from(negative)) as u8;
             let table = &faces[usize::from(face[i])];
-            for lanes in [&mut ray, &mut normal, &mut beam, &mut up] {
+            for lanes in [&mut *ray, &mut *normal, &mut *beam, &mut *up] {
                 let q = table.axes.map(|a| lanes[a][i]);
                 (lanes[0][i], lanes[1][i], lanes[2][i]) = (q[0], q[1], table.sign * q[2]);
             }
         }
     }
+    let table = |i: usize| if SEVERAL { faces.get(usize::from(face[i])).unwrap_or(only) } else { only };
 
     // Rays with unit depth. Loops over whole blocks, however many points there are: their length is known.
-    let (mut u, mut v, mut w): (Lane, Lane, Lane) = ([0.0; BLOCK], [0.0; BLOCK], [0.0; BLOCK]);
     for i in 0..BLOCK {
         w[i] = 1.0 / ray[2][i];
         u[i] = ray[0][i] * w[i];
         v[i] = ray[1][i] * w[i];
     }
+    // Places on the surfaces' planes.
+    let planes = slopes.planes.filter(|planes| planes.count() == faces.len());
+    if let Some(planes) = planes {
+        if SEVERAL {
+            for i in 0..n {
+                cell[i] = planes.face(usize::from(face[i])).cell(u[i], v[i], w[i]);
+            }
+        } else {
+            let face = planes.face(0);
+            for i in 0..BLOCK {
+                cell[i] = face.cell(u[i], v[i], w[i]);
+            }
+        }
+    }
 
     // The view's part: places on the tables, then the tables' cells, then the parabola in 1/Z.
-    let Some(only) = faces.first() else { return out[..n].fill(f32::NAN) };
-    let table = |i: usize| faces.get(usize::from(face[i])).unwrap_or(only);
-    let several = faces.len() > 1;
-    let mut places = Places::new();
     for i in 0..BLOCK {
-        places.locate(i, if several { table(i) } else { only }, u[i], v[i], w[i]);
+        places.locate(i, table(i), u[i], v[i], w[i]);
+        height[i] = table(i).height(u[i], v[i], w[i]);
     }
-    let mut sums: [Node; BLOCK] = [[f32::NAN; 8]; BLOCK];
     let mut to_do = [0u8; BLOCK];
     let mut open = 0;
     for i in 0..n {
-        if !places.inside[i] {
-            continue;
+        // The memory has time to bring it; many at once it would refuse.
+        if let Some(planes) = planes {
+            planes.face(usize::from(face[i])).fetch(cell[i]);
         }
-        let table = if several { table(i) } else { only };
-        let cell = [places.cell[0][i] as usize, places.cell[1][i] as usize];
-        match table.kind(cell) {
-            Cell::Interpolated => sums[i] = table.sums(cell, pick(&places.x, i), pick(&places.y, i)),
+        let at = [places.cell[0][i] as usize, places.cell[1][i] as usize];
+        part[i] = match if places.inside[i] { table(i).kind(at) } else { Cell::Outside } {
+            Cell::Interpolated => table(i).interpolated(at, pick(&places.x, i), pick(&places.y, i), height[i]),
             Cell::Exact => {
                 to_do[open] = i as u8;
                 open += 1;
+                [f32::NAN; 4]
             }
-            Cell::Outside => {}
-        }
+            Cell::Outside => [f32::NAN; 4],
+        };
     }
-    let mut part: [Lane; 3] = [[0.0; BLOCK]; 3];
-    for i in 0..BLOCK {
-        let efg = if several { table(i) } else { only }.shift(&sums[i], u[i], v[i], w[i]);
-        (part[0][i], part[1][i], part[2][i]) = (efg[0], efg[1], efg[2]);
+    if let Some(planes) = planes {
+        for i in 0..n {
+            if (slopes.normals.is_none() || !is_direction(pick(normal, i)))
+                && let Some(found) = planes.face(usize::from(face[i])).normal(cell[i], u[i], v[i], w[i])
+            {
+                (normal[0][i], normal[1][i], normal[2][i]) = (found[0], found[1], found[2]);
+            }
+        }
     }
 
     // Along the ray onto the surface.
@@ -167,10 +259,9 @@ fn fill_block_anywhere(sigma: &SurfaceSigma, faces: &[Face], xyz: &[[f64; 3]], s
         ObjectNoise::Scanner(_) => 0.0,
     };
     let min_cosine = MIN_COSINE as f32;
-    let mut variance: Lane = [0.0; BLOCK];
-    // m = n / (n · D) with the ray D = (u, v, 1)
-    let mut m: [Lane; 3] = [[0.0; BLOCK]; 3];
     for i in 0..BLOCK {
+        let [e, f, g, _] = part[i];
+        let [e, f, g] = table(i).shift([e, f, g], u[i], v[i], height[i]);
         let (u, v, z) = (u[i], v[i], ray[2][i]);
         let square = u * u + v * v + 1.0;
         let (n1, n2, n3) = (normal[0][i], normal[1][i], normal[2][i]);
@@ -190,8 +281,7 @@ fn fill_block_anywhere(sigma: &SurfaceSigma, faces: &[Face], xyz: &[[f64; 3]], s
         let k11 = 1.0 - 2.0 * u * m1 + m1 * m1 * square;
         let k12 = m1 * m2 * square - u * m2 - v * m1;
         let k22 = 1.0 - 2.0 * v * m2 + m2 * m2 * square;
-        variance[i] = z * z * (part[0][i] * k11 + 2.0 * part[1][i] * k12 + part[2][i] * k22)
-            + own * (1.0 + length2 * inverse * inverse);
+        variance[i] = z * z * (e * k11 + 2.0 * f * k12 + g * k22) + own * (1.0 + length2 * inverse * inverse);
         (m[0][i], m[1][i], m[2][i]) = (m1, m2, n3 * inverse);
     }
     if let Some(station) = &station {
@@ -210,7 +300,7 @@ fn fill_block_anywhere(sigma: &SurfaceSigma, faces: &[Face], xyz: &[[f64; 3]], s
             variance[i] += range * onto(&b) / range2 + horizontal * onto(&level) + vertical * onto(&steep) / level2;
         }
     }
-    for x in &mut variance {
+    for x in variance.iter_mut() {
         // Rounding may leave a little below zero; NaN stays.
         let half = 0.5 * *x;
         *x = if half < 0.0 { 0.0 } else { half }.sqrt();
@@ -250,7 +340,14 @@ impl Places {
         let last = table.last();
         self.inside[i] = (a >= 0.0) & (a <= last) & (b >= 0.0) & (b <= last) & (w > 0.0);
         let highest = last * 0.5 - 1.0;
-        let (ci, cj) = ((a * 0.5).clamp(0.0, highest) as i32, (b * 0.5).clamp(0.0, highest) as i32);
+        // Comparisons that turn NaN into 0.
+        let within = |x: f32| {
+            let x = if x > 0.0 { x } else { 0.0 };
+            if x < highest { x } else { highest }
+        };
+        // SAFETY: both are between 0 and half a side.
+        let (ci, cj) =
+            unsafe { (within(a * 0.5).to_int_unchecked::<i32>(), within(b * 0.5).to_int_unchecked::<i32>()) };
         (self.cell[0][i], self.cell[1][i]) = (ci, cj);
         let (x, y) = (weights(a - (2 * ci) as f32), weights(b - (2 * cj) as f32));
         (self.x[0][i], self.x[1][i], self.x[2][i]) = (x[0], x[1], x[2]);

@@ -21,7 +21,7 @@ pub const TOLERANCE: f64 = 2e-3;
 /// Nodes per side of a face's grid, tried in turn. The largest still fits about into a core's own cache.
 const GRIDS: [usize; 5] = [9, 17, 33, 65, 129];
 
-/// E F G of a symmetric 2×2 matrix, of A and of B, padded to a whole vector.
+/// E F G of a symmetric 2×2 matrix, of A and of B, each padded to half a vector.
 pub(super) type Node = [f32; 8];
 
 /// How a cell of the grid is to be used.
@@ -84,37 +84,45 @@ impl Face {
     #[inline(always)]
     pub fn sums(&self, [i, j]: [usize; 2], x: [f32; 3], y: [f32; 3]) -> Node {
         let mut sum: Node = [0.0; 8];
-        let first = 2 * j * self.side + 2 * i;
+        let nodes = &self.nodes[2 * j * self.side + 2 * i..][..2 * self.side + 3];
         for (row, wy) in y.iter().enumerate() {
-            let start = first + row * self.side;
-            let nodes = &self.nodes[start..start + 3];
-            for k in 0..3 {
-                let weight = x[k] * wy;
-                for lane in 0..8 {
-                    sum[lane] += weight * nodes[k][lane];
-                }
+            let nodes = &nodes[row * self.side..][..3];
+            for lane in 0..8 {
+                sum[lane] += wy * (x[0] * nodes[0][lane] + x[1] * nodes[1][lane] + x[2] * nodes[2][lane]);
             }
         }
         sum
     }
 
-    /// E F G of the shift in (u, v) from the interpolated coefficients.
+    /// How far w lies from the plane about which the parabola is written.
     #[inline(always)]
-    pub fn shift(&self, sum: &Node, u: f32, v: f32, w: f32) -> [f32; 3] {
-        let t = w - (self.plane[0] * u + self.plane[1] * v + self.plane[2]);
+    pub fn height(&self, u: f32, v: f32, w: f32) -> f32 {
+        w - (self.plane[0] * u + self.plane[1] * v + self.plane[2])
+    }
+
+    /// E F G of the part that is interpolated of the shift in (u, v), at a height; the last number means nothing.
+    #[inline(always)]
+    pub fn interpolated(&self, cell: [usize; 2], x: [f32; 3], y: [f32; 3], height: f32) -> [f32; 4] {
+        let sum = self.sums(cell, x, y);
+        std::array::from_fn(|k| sum[k] + height * sum[4 + k])
+    }
+
+    /// E F G of the shift in (u, v) with the part that has a closed form.
+    #[inline(always)]
+    pub fn shift(&self, part: [f32; 3], u: f32, v: f32, height: f32) -> [f32; 3] {
         let [c11, c12, c22, c13, c23, c33] = self.position;
-        let c = [
-            c11 - 2.0 * u * c13 + u * u * c33,
-            c12 - u * c23 - v * c13 + u * v * c33,
-            c22 - 2.0 * v * c23 + v * v * c33,
-        ];
-        std::array::from_fn(|i| sum[i] + t * (sum[3 + i] + t * c[i]))
+        let square = height * height;
+        [
+            part[0] + square * (c11 - 2.0 * u * c13 + u * u * c33),
+            part[1] + square * (c12 - u * c23 - v * c13 + u * v * c33),
+            part[2] + square * (c22 - 2.0 * v * c23 + v * v * c33),
+        ]
     }
 
     /// Whether the interpolated coefficients give the same figure as the true ones, at any depth.
     fn agrees(&self, cell: [usize; 2], u: f64, v: f64, truth: &[Matrix2<f64>; 3]) -> bool {
         let [a, b] = self.place(u as f32, v as f32);
-        let sum = self.sums(cell, weights(a - 2.0 * cell[0] as f32), weights(b - 2.0 * cell[1] as f32));
+        let (x, y) = (weights(a - 2.0 * cell[0] as f32), weights(b - 2.0 * cell[1] as f32));
         let w0 = f64::from(self.plane[0]) * u + f64::from(self.plane[1]) * v + f64::from(self.plane[2]);
         // The depth at which the far and the near part are equal is the parabola's own unit.
         let natural = (truth[0].trace() / truth[2].trace()).sqrt();
@@ -122,7 +130,10 @@ impl Face {
         let steps = [-30.0, -10.0, -3.0, -1.0, -0.3, 0.0, 0.3, 1.0, 3.0, 10.0, 30.0];
         let depths = steps.iter().map(|s| s * unit).chain([-w0, w0]);
         depths.filter(|dw| w0 + dw >= 0.0).all(|dw| {
-            let [e, f, g] = self.shift(&sum, u as f32, v as f32, (w0 + dw) as f32).map(f64::from);
+            let (u, v) = (u as f32, v as f32);
+            let height = self.height(u, v, (w0 + dw) as f32);
+            let [e, f, g, _] = self.interpolated(cell, x, y, height);
+            let [e, f, g] = self.shift([e, f, g], u, v, height).map(f64::from);
             let t = truth[0] + truth[1] * dw + truth[2] * (dw * dw);
             // A slanted surface weighs some direction: each must agree.
             [[1.0, 0.0], [0.0, 1.0], [0.7, 0.7], [0.7, -0.7]].iter().all(|[p, q]| {
@@ -278,7 +289,7 @@ impl<'a> Maker<'a> {
             self.coefficients(u, v).map_or([f32::NAN; 8], |[a, b, _]| {
                 let e = |m: &Matrix2<f64>| [m[(0, 0)] as f32, m[(0, 1)] as f32, m[(1, 1)] as f32];
                 let ([a1, a2, a3], [b1, b2, b3]) = (e(&a), e(&b));
-                [a1, a2, a3, b1, b2, b3, 0.0, 0.0]
+                [a1, a2, a3, 0.0, b1, b2, b3, 0.0]
             })
         };
         let cells = (side - 1) / 2;

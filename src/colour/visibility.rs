@@ -89,7 +89,8 @@ impl VisibilityMap {
 
     /// The slopes of the surfaces that the photo sees.
     pub fn planes(&self) -> LocalPlanes {
-        LocalPlanes::new(&self.view, self.surfaces.grid, &self.surfaces.samples)
+        let Surfaces { grid, samples, noise, .. } = &self.surfaces;
+        LocalPlanes::new(&self.view, *grid, samples, *noise)
     }
 
     /// The nearest depth in each pixel of the photo, row by row; NaN where there is no point.

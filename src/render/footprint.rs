@@ -87,6 +87,8 @@ pub struct Surfaces {
     pub samples: Vec<Sample>,
     /// A point in this cell is hidden when its inverse depth is below this; 0 where nothing hides.
     pub limit: Vec<f32>,
+    /// Sigma of a depth, in the cloud's unit, as samples scatter about planes.
+    pub noise: f32,
 }
 
 impl Surfaces {
@@ -155,7 +157,7 @@ impl Surfaces {
             }
         }
         close(&grid, &mut limit);
-        Ok(Self { grid, samples, limit })
+        Ok(Self { grid, samples, limit, noise: wide_noise })
     }
 }
 

@@ -17,6 +17,8 @@ mod pyramid;
 pub mod resampling;
 mod sample;
 pub mod sci;
+mod window_fit;
+mod windows;
 mod zbuffer;
 
 pub use drawing::Splat;

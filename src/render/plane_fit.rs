@@ -7,15 +7,15 @@
 /// Planes through three samples that are tried.
 const TRIALS: u32 = 16;
 /// So many of all samples within the tolerance, and the least-squares plane needs no trial.
-const NEARLY_ALL: f32 = 0.9;
+pub(super) const NEARLY_ALL: f32 = 0.9;
 /// The fewest samples of a plane.
 pub(super) const FEWEST: usize = 8;
 /// The smallest share of a window's samples on its first plane, and on the second.
-const SHARE: [f32; LAYERS] = [0.3, 0.1];
+pub(super) const SHARE: [f32; LAYERS] = [0.3, 0.1];
 /// Surfaces told apart in one window.
 pub(super) const LAYERS: usize = 2;
 /// How many sigmas a sample may lie off its plane.
-const SIGMAS: f32 = 3.0;
+pub(super) const SIGMAS: f32 = 3.0;
 /// The square of the sine below which two directions are one.
 const ONE_LINE: f64 = 1e-3;
 
@@ -45,6 +45,16 @@ impl Noise {
     }
 }
 
+/// What samples sum up to: their mean (a, b, w), and sums of products about it.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Moments {
+    pub mean: [f64; 3],
+    /// aa ab bb
+    pub spread: [f64; 3],
+    /// aw bw
+    pub rise: [f64; 2],
+}
+
 /// w = c + ga·a + gb·b
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Plane {
@@ -58,6 +68,17 @@ pub(super) struct Plane {
     pub weakness: f32,
 }
 
+/// The least-squares plane of all samples of a window.
+#[cfg_attr(not(target_arch = "x86_64"), allow(dead_code, reason = "made where there is a kernel for it"))]
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Fit {
+    pub plane: Option<Plane>,
+    /// All samples.
+    pub count: usize,
+    /// Those that lie on the plane.
+    pub near: usize,
+}
+
 impl Plane {
     #[inline(always)]
     fn off(&self, s: &Spot) -> f32 {
@@ -65,7 +86,7 @@ impl Plane {
     }
 
     #[inline(always)]
-    fn slope(&self) -> f32 {
+    pub fn slope(&self) -> f32 {
         self.ga.abs() + self.gb.abs()
     }
 
@@ -92,21 +113,34 @@ impl Plane {
             bw += y * z;
             ww += z * z;
         }
+        let (plane, [ga, gb]) = Self::of(&Moments { mean: [a, b, w], spread: [aa, ab, bb], rise: [aw, bw] })?;
+        Some(plane.leaving(ww - ga * aw - gb * bw, n))
+    }
+
+    /// By least squares from what the samples sum up to, with the gradient in full; what they leave over is not known yet.
+    /// `None` where they lie on one line.
+    pub fn of(moments: &Moments) -> Option<(Self, [f64; 2])> {
+        let Moments { mean: [a, b, w], spread: [aa, ab, bb], rise: [aw, bw] } = *moments;
         let det = aa * bb - ab * ab;
         let trace = aa + bb;
         if det.is_nan() || det <= ONE_LINE * trace * trace {
             return None;
         }
         let (ga, gb) = ((bb * aw - ab * bw) / det, (aa * bw - ab * aw) / det);
-        let left = (ww - ga * aw - gb * bw).max(0.0);
         let smallest = 0.5 * trace - (0.25 * trace * trace - det).max(0.0).sqrt();
-        Some(Self {
+        let plane = Self {
             c: (w - ga * a - gb * b) as f32,
             ga: ga as f32,
             gb: gb as f32,
-            rms: (left / (n - 3.0).max(1.0)).sqrt() as f32,
+            rms: 0.0,
             weakness: smallest.max(f64::MIN_POSITIVE).sqrt().recip() as f32,
-        })
+        };
+        Some((plane, [ga, gb]))
+    }
+
+    /// With the sum of the squares of what `n` samples leave over.
+    pub fn leaving(self, squares: f64, n: f64) -> Self {
+        Self { rms: (squares.max(0.0) / (n - 3.0).max(1.0)).sqrt() as f32, ..self }
     }
 
     /// Through three samples.
@@ -122,7 +156,7 @@ impl Plane {
     }
 
     #[inline(always)]
-    fn holds(&self, s: &Spot, noise: &Noise) -> bool {
+    pub fn holds(&self, s: &Spot, noise: &Noise) -> bool {
         self.off(s) <= SIGMAS * noise.sigma(s.w, self.slope())
     }
 }

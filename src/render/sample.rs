@@ -52,12 +52,26 @@ impl Sample {
 
     /// The bits of the inverse depths of eight samples.
     #[cfg(target_arch = "x86_64")]
+    #[inline]
     #[target_feature(enable = "avx2")]
     pub(super) fn inverse_depth_bits(samples: std::arch::x86_64::__m256i) -> std::arch::x86_64::__m256i {
         use std::arch::x86_64::*;
         let steps = _mm256_slli_epi32::<{ DROPPED as i32 }>(_mm256_srli_epi32::<{ 2 * PLACE as i32 }>(samples));
         let middle = _mm256_or_si256(steps, _mm256_set1_epi32(1 << (DROPPED - 1)));
         _mm256_add_epi32(middle, _mm256_set1_epi32(BASE as i32))
+    }
+
+    /// The places of eight samples, right and down.
+    #[cfg(target_arch = "x86_64")]
+    #[inline]
+    #[target_feature(enable = "avx2")]
+    pub(super) fn places(samples: std::arch::x86_64::__m256i) -> [std::arch::x86_64::__m256; 2] {
+        use std::arch::x86_64::*;
+        let (mask, step) = (_mm256_set1_epi32((1 << PLACE) - 1), _mm256_set1_ps(1.0 / STEPS));
+        let first = _mm256_set1_ps(0.5 / STEPS - 0.5);
+        let right = _mm256_cvtepi32_ps(_mm256_and_si256(_mm256_srli_epi32::<{ PLACE as i32 }>(samples), mask));
+        let down = _mm256_cvtepi32_ps(_mm256_and_si256(samples, mask));
+        [_mm256_add_ps(_mm256_mul_ps(right, step), first), _mm256_add_ps(_mm256_mul_ps(down, step), first)]
     }
 
     /// Which of eight samples are empty, the first in the lowest bit.

@@ -118,7 +118,7 @@ impl Surfaces {
             || depth_noise(view, grid, &samples, place),
         );
         let Footprint { tolerance, inner, .. } = *footprint;
-        let rule = Rule { tolerance, inner, pixel_angle, noise: surroundings.noise, wide_noise };
+        let rule = Rule { tolerance, inner, pixel_angle, noise: surroundings.noise(), wide_noise };
         let mut limit = fetched(grid.len(), "the surfaces of a depth buffer")?;
         let mut spacing: Vec<u8> = fetched(grid.len(), "the spacing of points")?;
         // Each band fills its own part.

@@ -9,12 +9,11 @@ use rayon::prelude::*;
 
 use super::extremes::{larger, smaller};
 use super::flat::BLOCK;
+use super::patch::{Link, Patch, Pruning, QUADRANTS};
 use super::pyramid::Pyramid;
 use super::sample::Sample;
 use super::zbuffer::{Grid, PAD};
 
-/// East, south, west, north.
-pub(super) const QUADRANTS: usize = 4;
 /// Samples that are looked at together.
 pub(super) const LANES: usize = 8;
 /// By how much two depths of one surface may differ beside what their distance makes, relative.
@@ -37,158 +36,15 @@ pub(super) struct Links {
 
 const NONE: (i8, i8) = (0, 0);
 
-/// A neighbour as the sample sees it. `distance` is 0 for none.
-#[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Link {
-    dx: f32,
-    dy: f32,
-    /// By how much its inverse depth is larger.
-    rise: f32,
-    pub distance: f32,
-}
-
-impl Link {
-    #[inline(always)]
-    pub fn found(&self) -> bool {
-        self.distance > 0.0
-    }
-
-    #[inline(always)]
-    fn slope(&self) -> f32 {
-        self.rise / self.distance
-    }
-
-    /// Itself, or none.
-    #[inline(always)]
-    fn unless(&self, dropped: bool) -> Self {
-        let kept = |v: f32| if dropped { 0.0 } else { v };
-        Self { dx: kept(self.dx), dy: kept(self.dy), rise: kept(self.rise), distance: kept(self.distance) }
-    }
-}
-
-/// What the neighbours say of the surface at a sample.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Patch {
-    /// Inverse depth of the sample.
-    pub own: f32,
-    /// Where it lies against its pixel's centre.
-    pub place: [f32; 2],
-    pub links: [Link; QUADRANTS],
-}
-
-impl Patch {
-    /// The distance of the second nearest neighbour: two are needed to call it a surface. Infinite without.
-    #[inline(always)]
-    pub fn spacing(&self) -> f32 {
-        let (mut first, mut second) = (f32::INFINITY, f32::INFINITY);
-        for link in &self.links {
-            let d = if link.found() { link.distance } else { f32::INFINITY };
-            second = smaller(second, larger(first, d));
-            first = smaller(first, d);
-        }
-        second
-    }
-
-    /// The spacing in quarters of a pixel; 0 for unknown.
-    #[inline(always)]
-    pub fn spacing_code(&self) -> u8 {
-        let spacing = self.spacing();
-        if spacing < f32::INFINITY { (4.0 * spacing + 1.0) as u8 } else { 0 }
-    }
-
-    /// The plane through the sample that fits the neighbours best: the change of the inverse depth by one cell.
-    #[inline(always)]
-    pub fn gradient(&self) -> [f32; 2] {
-        let (mut xx, mut xy, mut yy, mut xr, mut yr) = (0.0_f32, 0.0, 0.0, 0.0, 0.0);
-        for link in &self.links {
-            // One that is not there has zeros everywhere.
-            let w = if link.found() { 1.0 / (link.distance * link.distance) } else { 0.0 };
-            xx += w * link.dx * link.dx;
-            xy += w * link.dx * link.dy;
-            yy += w * link.dy * link.dy;
-            xr += w * link.dx * link.rise;
-            yr += w * link.dy * link.rise;
-        }
-        let ridge = 1e-3 * (xx + yy) + 1e-12;
-        let (a, c) = (xx + ridge, yy + ridge);
-        let det = a * c - xy * xy;
-        [(c * xr - xy * yr) / det, (a * yr - xy * xr) / det]
-    }
-
-    /// How much nearer than the sample itself the plane with this gradient passes that fits sample and neighbours.
-    #[inline(always)]
-    pub fn lift(&self, [gx, gy]: [f32; 2]) -> f32 {
-        let (mut sum, mut n) = (0.0, 1.0);
-        for link in &self.links {
-            sum += link.rise - gx * link.dx - gy * link.dy;
-            n += if link.found() { 1.0 } else { 0.0 };
-        }
-        sum / n
-    }
-
-    /// How far the sample lies off the line between two opposite neighbours; the sum for both pairs.
-    #[inline(always)]
-    pub fn misfit(&self) -> f32 {
-        let off = |k| if self.between(k) { self.off_line(k).0.abs() } else { 0.0 };
-        off(0) + off(1)
-    }
-
-    /// Whether there are neighbours in quadrants `k` and `k + 2`.
-    #[inline(always)]
-    fn between(&self, k: usize) -> bool {
-        self.links[k].found() & self.links[k + 2].found()
-    }
-
-    /// The sample's inverse depth against the line between the neighbours of quadrants `k` and `k + 2`; and by how much
-    /// its sigma exceeds that of one depth.
-    #[inline(always)]
-    fn off_line(&self, k: usize) -> (f32, f32) {
-        let (a, b) = (self.links[k], self.links[k + 2]);
-        let all = a.distance + b.distance;
-        let (wa, wb) = (b.distance / all, a.distance / all);
-        (wa * a.rise + wb * b.rise, (1.0 + wa * wa + wb * wb).sqrt())
-    }
-
-    /// Drops what does not belong: of two opposite neighbours that are not on one line with the sample the steeper when
-    /// it is steep, and what is too far for the spacing.
-    #[inline(always)]
-    fn prune(&mut self, s: &Surroundings<'_>) {
-        for k in 0..2 {
-            let (a, b) = (self.links[k], self.links[k + 2]);
-            let near = smaller(a.distance, b.distance);
-            let (sa, sb) = (a.slope().abs(), b.slope().abs());
-            let bend = (a.slope() + b.slope()).abs() * near;
-            let allowed = self.own * (5.0 * s.noise * self.own + s.usual * near) + 0.5 * near * smaller(sa, sb);
-            let bent = self.between(k) & (bend > allowed) & (larger(sa, sb) > self.own * s.usual);
-            self.links[k] = a.unless(bent & (sa > sb));
-            self.links[k + 2] = b.unless(bent & (sa <= sb));
-        }
-        let (before, spacing) = (self.links, self.spacing());
-        for (k, link) in self.links.iter_mut().enumerate() {
-            let opposite = before[(k + 2) % QUADRANTS].distance;
-            // A scan at a grazing angle has rows far apart, but on both sides; a bar has a gap on one.
-            let ratio = if 2.0 * opposite > link.distance { s.row_ratio } else { s.gap_ratio };
-            *link = link.unless(link.distance > ratio * spacing);
-        }
-    }
-}
-
 /// The samples, and what makes two of them neighbours on one surface.
 pub(super) struct Surroundings<'a> {
     pub grid: Grid,
     pub samples: &'a [Sample],
-    /// Sigma of a depth, in the cloud's unit.
-    pub noise: f32,
     /// By how much two depths of one surface may differ in one place, relative.
     tolerance: f32,
     /// The largest relative change by one cell.
     steepest: f32,
-    /// The largest relative change by one cell that is nothing special.
-    usual: f32,
-    /// How many times the spacing a gap may be wide.
-    gap_ratio: f32,
-    /// The same where gaps follow each other as the rows of a scan do.
-    row_ratio: f32,
+    pruning: Pruning,
     rings: [[Probe; RING]; QUADRANTS],
 }
 
@@ -316,9 +172,15 @@ impl<'a> Surroundings<'a> {
         });
         let [gap_ratio, row_ratio] = ratios;
         let usual = USUAL * pixel_angle;
-        let mut this = Self { grid, samples, noise: 0.0, tolerance, steepest, usual, gap_ratio, row_ratio, rings };
-        this.noise = this.depth_noise();
+        let pruning = Pruning { noise: 0.0, usual, gap_ratio, row_ratio };
+        let mut this = Self { grid, samples, tolerance, steepest, pruning, rings };
+        this.pruning.noise = this.depth_noise();
         this
+    }
+
+    /// Sigma of a depth, in the cloud's unit.
+    pub fn noise(&self) -> f32 {
+        self.pruning.noise
     }
 
     #[inline(always)]
@@ -354,7 +216,7 @@ impl<'a> Surroundings<'a> {
     #[inline(always)]
     fn pruned(&self, links: &mut Links) -> Patch {
         let mut patch = self.patch(links);
-        patch.prune(self);
+        patch.prune(&self.pruning);
         for (near, link) in links.near.iter_mut().zip(&patch.links) {
             if !link.found() {
                 *near = NONE;
@@ -442,7 +304,7 @@ impl<'a> Surroundings<'a> {
             links[k] = link.unless(!other.found());
         }
         let mut patch = Patch { own, place, links };
-        patch.prune(self);
+        patch.prune(&self.pruning);
         patch
     }
 
@@ -465,10 +327,10 @@ impl<'a> Surroundings<'a> {
         let spacing = patch.spacing();
         let mut farthest = 0.0;
         for (k, link) in patch.links.iter().enumerate() {
-            let (opposite, rows) = (patch.links[(k + 2) % QUADRANTS], self.row_ratio * spacing);
+            let (opposite, rows) = (patch.links[(k + 2) % QUADRANTS], self.pruning.row_ratio * spacing);
             // Between the rows of a grazing scan both are missing at first, and neither is to wait for the other.
             let rows = if opposite.found() { smaller(2.0 * opposite.distance, rows) } else { rows };
-            let reach = larger(rows, self.gap_ratio * spacing);
+            let reach = larger(rows, self.pruning.gap_ratio * spacing);
             farthest = if link.found() { farthest } else { larger(farthest, reach) };
         }
         farthest
@@ -526,7 +388,7 @@ impl<'a> Surroundings<'a> {
             }
             let d = ((dx * dx + dy * dy) as f32).sqrt();
             let its = spacing[other as usize];
-            let near = d <= reach && (its == 0 || d <= 0.25 * f32::from(its) * self.row_ratio);
+            let near = d <= reach && (its == 0 || d <= 0.25 * f32::from(its) * self.pruning.row_ratio);
             if d < best[k] && near && self.one_surface(patch.own, self.samples[other as usize].inverse_depth(), d) {
                 best[k] = d;
                 links.near[k] = (dx as i8, dy as i8);

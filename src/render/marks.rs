@@ -2,7 +2,8 @@
 //! sample and its neighbours.
 
 use super::extremes::{larger, smaller};
-use super::links::{LANES, Patch, QUADRANTS};
+use super::links::LANES;
+use super::patch::{Patch, QUADRANTS};
 use super::zbuffer::Grid;
 
 /// The farthest that a mark reaches, rows.

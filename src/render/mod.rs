@@ -10,6 +10,7 @@ mod footprint;
 pub mod intensity;
 mod links;
 mod marks;
+mod patch;
 mod picture;
 mod plane_fit;
 mod planes;

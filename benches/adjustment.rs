@@ -78,7 +78,7 @@ fn adjustment(c: &mut Criterion) {
         b.iter(|| adjusted(&view(), 10_000, &calibration, &FullOptions::default()));
     });
     for (names, free) in [("pose", &pose), ("pose, f, pp, distortion", &calibration)] {
-        for blunders in [0, 100] {
+        for blunders in [0, 50, 500] {
             group.bench_function(format!("snooping, {names}, 10000 points, {blunders} blunders"), |b| {
                 b.iter(|| with_blunders(&view(), 10_000, blunders, free, &FullOptions::default()));
             });

@@ -4,8 +4,9 @@ Points are in the scan's frame, and all bring them into the camera's first. Peer
 of NumPy and OpenCV (``projectPoints``, ``minimum.at``, tolerance of 1 %, ``remap``), the same with pose and projection
 written in NumPy, and the same fused in a parallel numba kernel with a depth buffer for each thread. They hide only what
 falls into the same pixel; colourreg makes surfaces of the points, so that walls hide what shines through between their
-points, which is more work. Each in a process of its own on the same input, as scanned and shuffled. Limits: the photo
-is made up.
+points, which is more work. Each in a process of its own on the same input, as scanned and shuffled, after a call with
+a thousandth of the points, since numba has to be called once before: for all of them threads stand ready and memory has
+been touched then. Limits: the photo is made up.
 
     python -m benches.peers.colouring [--points 10000000] [--repeats 3]
 """
@@ -33,6 +34,7 @@ def photo() -> np.ndarray:
 
 def _timed(points: str, order: str, run: Callable[[np.ndarray, np.ndarray], Any], scale: int = 1) -> float:
     xyz, image = building.cloud(int(points), order), photo()
+    run(np.ascontiguousarray(xyz[::1000]), image)
     forget_peak()
     began = time.perf_counter()
     rgb, seen = run(xyz, image)
@@ -135,7 +137,6 @@ def numba_fused(points: str, order: str) -> float:
         kernel(xyz, image, depths, rgb, seen)
         return rgb, seen
 
-    run(building.cloud(10_000), photo())
     return _timed(points, order, run)
 
 

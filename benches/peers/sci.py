@@ -6,9 +6,10 @@ near surfaces hide some of what shines through between their points. What colour
 surfaces between the points, also holds where gaps are wider than that; it has a row of its own, and so has the whole of
 `render_sci`, which corrects and stretches the intensity, fills holes and gives each point's index and place as well.
 Points in the order of the scan and shuffled. All contenders run in turn in processes of their own on the same input;
-numba's compilation is not timed, nor is any import. Open3D draws one pixel to the point alone. Depths are compared with
-NumPy's. Limits: a made-up building of walls at four distances; a machine that does other things moves all figures, the
-ratios less.
+numba's compilation is not timed, nor is any import, and all were called with a thousandth of the points before, as
+numba has to be, so that threads stand ready and memory has been touched. Open3D draws one pixel to the point alone.
+Depths are compared with NumPy's. Limits: a made-up building of walls at four distances; a machine that does other
+things moves all figures, the ratios less.
 
     python -m benches.peers.sci [--points 10000000] [--repeats 3]
 """
@@ -127,6 +128,7 @@ def numba_kernels():
 
 def _timed(run, points, order, footprint, check=False):
     xyz, intensity = cloud(int(points), order)
+    run(np.ascontiguousarray(xyz[::1000]), intensity[::1000].copy(), int(footprint))
     begin = time.perf_counter()
     depth, _ = run(xyz, intensity, int(footprint))
     seconds = time.perf_counter() - begin
@@ -156,9 +158,7 @@ def numpy_minimum_at(points, order, footprint):
 
 
 def numba_private_buffers(points, order, footprint):
-    run = numba_kernels()
-    run(np.ones((10, 3)), np.ones(10, np.float32), 1)
-    return _timed(run, points, order, footprint)
+    return _timed(numba_kernels(), points, order, footprint)
 
 
 def by_open3d(xyz, intensity):
@@ -181,10 +181,12 @@ def by_open3d(xyz, intensity):
 
 
 def open3d(points, order, footprint):
+    by_open3d(*cloud(int(points) // 1000, order))
     return by_open3d(*cloud(int(points), order))[0]
 
 
 def open3d_cloud_at_hand(points, order, footprint):
+    by_open3d(*cloud(int(points) // 1000, order))
     return by_open3d(*cloud(int(points), order))[1]
 
 

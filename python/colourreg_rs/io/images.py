@@ -28,6 +28,9 @@ Pixels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 #: Photos above this are refused: 3 GB for 8 bits, 6 GB for 16.
 MAX_PIXELS = 1_000_000_000
 
+#: Rows of a picture that Pillow gives at a time.
+_STRIP = 64
+
 #: Diagonal of a frame of 35 mm film, mm.
 _FILM_DIAGONAL = math.hypot(36.0, 24.0)
 _EXPORT = "export it as JPEG, PNG or TIFF with 8 or 16 bits"
@@ -370,8 +373,13 @@ def _eight_bits(path: Path, image: Image.Image) -> npt.NDArray[np.uint8]:
     elif mode not in ("L", "RGB"):
         image = image.convert("RGB")
     image.load()
-    pixels = np.array(image)
-    return pixels.reshape(*pixels.shape[:2], -1)
+    # Strip by strip: Pillow packs a picture into one new string, by way of as many bytes again in pieces, which for a
+    # large photo is three times its size in memory that nobody has touched before.
+    pixels = np.empty((image.height, image.width, len(image.getbands())), np.uint8)
+    for top in range(0, image.height, _STRIP):
+        strip = np.asarray(image.crop((0, top, image.width, min(top + _STRIP, image.height))))
+        pixels[top : top + _STRIP] = strip.reshape(len(strip), image.width, -1)
+    return pixels
 
 
 def _png16(path: Path) -> npt.NDArray[np.uint16]:

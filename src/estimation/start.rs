@@ -5,6 +5,7 @@
 
 use nalgebra::Vector3;
 
+use super::batch::LANES;
 use super::fit::fit_plainly;
 use super::levenberg::Limits;
 use super::observations::Observations;
@@ -77,6 +78,7 @@ pub(super) fn search(observations: &Observations, camera: &Camera, free: &FreeSe
     let size = f64::from(camera.width.max(camera.height));
     let cap = (0.5 * size / judged.precision.typical_sigma()).powi(2);
     let cameras = cameras_to_try(camera, free);
+    let mut enough = f64::INFINITY;
     let mut found: Vec<(f64, &Camera, Pose)> = Vec::with_capacity(4 * TRIPLES * cameras.len());
     for camera in &cameras {
         // Corners come again in many triples, and undoing a distortion is an iteration.
@@ -84,14 +86,17 @@ pub(super) fn search(observations: &Observations, camera: &Camera, free: &FreeSe
         for triple in &triples {
             let [Some(a), Some(b), Some(c)] = triple.map(|k| seen[k]) else { continue };
             for pose in p3p(&triple.map(|k| judged.xyz[corners[k]]), &[a, b, c]).iter() {
-                found.push((capped_cost(&judged, &View::new(*camera, *pose), cap), camera, *pose));
+                if let Some(cost) = capped_cost(&judged, &View::new(*camera, *pose), cap, enough) {
+                    if judged.len() >= MANY {
+                        enough = enough.min(NO_START * cost.max(1.0));
+                    }
+                    found.push((cost, camera, *pose));
+                }
             }
         }
     }
     let mut order: Vec<usize> = (0..found.len()).collect();
     order.sort_by(|&a, &b| found[a].0.total_cmp(&found[b].0));
-    let enough =
-        order.first().filter(|_| judged.len() >= MANY).map_or(f64::INFINITY, |&i| NO_START * found[i].0.max(1.0));
     let mut distinct: Vec<(&Camera, &Pose)> = Vec::with_capacity(REFINED);
     for (cost, camera, pose) in order.iter().map(|&i| &found[i]) {
         if distinct.len() == REFINED || *cost > enough {
@@ -149,8 +154,25 @@ pub(super) fn alike(a: &Pose, b: &Pose, limit: f64) -> bool {
     turn.norm() < limit && shift.norm() < limit * a.centre.norm().max(b.centre.norm())
 }
 
-fn capped_cost(observations: &Observations, view: &View, cap: f64) -> f64 {
-    observations.squares(view).iter().map(|s| s.min(cap)).sum::<f64>() / observations.len() as f64
+/// The mean squared misclosure, each at most `cap`; `None` where it comes to more than `enough`.
+fn capped_cost(observations: &Observations, view: &View, cap: f64, enough: f64) -> Option<f64> {
+    let n = observations.len() as f64;
+    let mut sum = 0.0;
+    let mut add = |square: f64| {
+        sum += square.min(cap);
+        (sum <= enough * n).then_some(())
+    };
+    if let Some((flat, sigma)) = observations.flat(view) {
+        let mut left = observations.len();
+        for batch in observations.batches() {
+            let squares = flat.squares(batch);
+            squares.iter().take(left).try_for_each(|s| add(s / (sigma * sigma)))?;
+            left = left.saturating_sub(LANES);
+        }
+    } else {
+        (0..observations.len()).try_for_each(|i| add(observations.square(view, i)))?;
+    }
+    Some(sum / n)
 }
 
 /// Triples of corners, by their places among them, the largest triangles first.

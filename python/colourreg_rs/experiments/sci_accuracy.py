@@ -8,6 +8,9 @@ region that it states for the six parameters of the pose.
 
     python -m colourreg_rs.experiments.sci_accuracy --scene facade --scene room --seeds 10
 
+``--columns`` turns the scanner by a share of its step, and ``--finer`` divides the step: the same photo, other points.
+What changes then is due to where the scan's columns happen to lie.
+
 Source of the region: χ² with six degrees of freedom of the error in the covariance's metric.
 """
 
@@ -29,6 +32,7 @@ from .. import _core
 from ..matching.register_sci import SciOptions, SciRegistration, register_sci
 from ..model import FloatArray, PointCloud, Pose, View
 from ..sci import render_sci, with_size
+from ..simulate.scanner import Scanner
 from . import options
 
 #: χ² with six degrees of freedom holds 95 % below this.
@@ -78,14 +82,33 @@ class Outcome:
         return self.distance < LIMIT_95
 
 
-def simulated(scene: str, seed: int, size: tuple[int, int], cache: Path | None = None) -> Case:
+@dataclass(frozen=True)
+class Grid:
+    """How the scanner's directions differ from the scene's own: columns moved by a share of the step, and the step
+    divided."""
+
+    columns: float = 0.0
+    finer: float = 1.0
+
+    def of(self, scanner: Scanner) -> Scanner:
+        """The scanner with these directions."""
+        first, last = (edge + self.columns * scanner.step for edge in scanner.azimuth)
+        return replace(scanner, azimuth=(first, last), step=scanner.step / self.finer)
+
+
+#: The scene's own.
+GIVEN = Grid()
+
+
+def simulated(scene: str, seed: int, size: tuple[int, int], cache: Path | None = None, grid: Grid = GIVEN) -> Case:
     """A scene's first photo and its scan; kept in ``cache`` where that is given."""
     from ..simulate import simulate
 
-    file = None if cache is None else cache / f"{scene}-{seed}-{size[0]}x{size[1]}.pickle"
+    other = "" if grid == GIVEN else f"-{grid.columns}-{grid.finer}"
+    file = None if cache is None else cache / f"{scene}-{seed}-{size[0]}x{size[1]}{other}.pickle"
     if file is not None and file.exists():
         return Case(scene, seed, *pickle.loads(file.read_bytes()))
-    made = simulate(scene, seed=seed, photos=1, size=size, samples=4)
+    made = simulate(scene, seed=seed, photos=1, size=size, samples=4, scanner=grid.of)
     photo = made.photos[0]
     parts = (made.scan, photo.image, replace(photo.view), made.stations[0])
     if file is not None:
@@ -154,6 +177,7 @@ def run(
     cache: Path | None = None,
     starts: Sequence[tuple[float, float]] = STARTS,
     kept: Path | None = None,
+    grid: Grid = GIVEN,
 ) -> Iterator[Outcome]:
     """All seeds, scenes and starts, in this order, so that what is there after an interruption has all kinds.
 
@@ -166,7 +190,7 @@ def run(
         for degrees, metres in starts:
             outcome = done.get((scene, seed, degrees, metres))
             if outcome is None:
-                case = case or simulated(scene, seed, size, cache)
+                case = case or simulated(scene, seed, size, cache, grid)
                 outcome = register(case, degrees, metres)[0]
                 if kept is not None:
                     with kept.open("a", encoding="utf-8") as file:
@@ -235,7 +259,12 @@ def main() -> None:
     parser.add_argument("--start", type=float, action="append", help="0.5 or 3 degrees off; both unless one is given")
     parser.add_argument("--cache", type=Path, help="a folder that keeps the simulations")
     parser.add_argument("--keep", type=Path, help="a file that keeps the outcomes: a run that was stopped goes on")
+    parser.add_argument("--columns", type=float, default=0.0, help="turn the scanner by this share of its step")
+    parser.add_argument("--finer", type=float, default=1.0, help="divide the scanner's step by this")
     arguments = parser.parse_args()
+    grid = Grid(arguments.columns, arguments.finer)
+    if arguments.keep is not None and grid != GIVEN:
+        parser.error("--keep knows scans by scene and seed alone: leave it out with --columns and --finer")
     width, height = (int(n) for n in arguments.size.split("x"))
     wanted = arguments.start or [degrees for degrees, _ in STARTS]
     starts = [start for start in STARTS if start[0] in wanted]
@@ -244,7 +273,7 @@ def main() -> None:
     scenes, seeds = arguments.scene or ["facade", "room"], arguments.seeds
     outcomes = []
     print(HEADER, flush=True)
-    for outcome in run(scenes, seeds, (width, height), arguments.cache, starts, arguments.keep):
+    for outcome in run(scenes, seeds, (width, height), arguments.cache, starts, arguments.keep, grid):
         print(line(outcome), flush=True)
         for reason in outcome.reasons:
             print(f"    {reason}", flush=True)

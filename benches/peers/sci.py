@@ -53,14 +53,9 @@ def by_numpy(xyz, intensity, footprint):
 
 
 def by_colourreg(xyz, intensity, footprint):
-    from colourreg_rs import _core
+    from colourreg_rs import PointCloud, draw_points
 
-    view = building.view(WIDTH, HEIGHT)
-    if footprint == 1:
-        return _core.sci_picture(view, xyz, intensity)
-    buffer = _core.IndexBuffer(view)
-    buffer.add(xyz)
-    return buffer.draw(intensity, splat=footprint)
+    return draw_points(PointCloud(xyz, intensity=intensity), bench_view(), splat=footprint)
 
 
 def by_surfaces(xyz, intensity, footprint):
@@ -76,15 +71,19 @@ def by_surfaces(xyz, intensity, footprint):
     return depth, grey
 
 
-def by_render_sci(xyz, intensity, footprint):
-    from colourreg_rs import Camera, PointCloud, Pose, View
-    from colourreg_rs.sci import render_sci
+def bench_view():
+    from colourreg_rs import Camera, Pose, View
 
     names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
     params = dict(zip(names, building.camera(WIDTH, HEIGHT).tolist(), strict=True))
     camera, pose = Camera("OPENCV", WIDTH, HEIGHT, params), Pose(building.ROTATION, building.TRANSLATION)
-    view = View("bench", "", camera=camera, pose=pose)
-    sci = render_sci(PointCloud(xyz, intensity=intensity), view)
+    return View("bench", None, camera=camera, pose=pose)
+
+
+def by_render_sci(xyz, intensity, footprint):
+    from colourreg_rs import PointCloud, render_sci
+
+    sci = render_sci(PointCloud(xyz, intensity=intensity), bench_view())
     return sci.depth, sci.raw
 
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from .io.points import read_points
     from .io.registration import read_camera, read_registration, write_registration
     from .register import RegisterOptions, register_photo
-    from .sci import SCI, render_sci
+    from .sci import SCI, draw_points, render_sci
 
 #: The workflow and the files, imported when first used: `import colourreg_rs` stays as quick as numpy's.
 _LATER = {
@@ -35,6 +35,7 @@ _LATER = {
     "RegisterOptions": "register",
     "backproject_file": "backproject",
     "colourise_file": "colourise",
+    "draw_points": "sci",
     "evaluate_view": "evaluate",
     "read_camera": "io.registration",
     "read_cloud": "io.clouds",
@@ -69,6 +70,7 @@ __all__ = [
     "__version__",
     "backproject_file",
     "colourise_file",
+    "draw_points",
     "evaluate_view",
     "read_camera",
     "read_cloud",

@@ -46,6 +46,9 @@ class View:
         """From a camera model's name and parameters (in the order of ``model.PARAMETER_NAMES``) and
         ``x_cam = rotation @ X + translation``. Raises InvalidInputError."""
 
+    def check_focal(self) -> None:
+        """Raises InvalidInputError for a focal length below 0.05 or above 10,000 times the longer side."""
+
     @classmethod
     def dlt(cls, P: FloatArray, width: int, height: int, distortion: FloatArray) -> View:
         """From a (3, 4) projection matrix of any scale and sign, and distortion terms k1 k2 p1 p2 k3 (5,), which act as
@@ -160,8 +163,8 @@ def sci_picture(
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
     """Depth (H, W) and value (H, W) of the nearest point in each pixel, NaN where there is none, of points (N, 3) that
     have a value (N,) each: as an :class:`IndexBuffer` that is drawn, but in one go, which is faster and takes about as
-    long whatever the order of the points. On the way they are sorted, as many at once as there are pixels, 12 bytes
-    each. Raises InvalidInputError where sizes do not fit."""
+    long whatever the order of the points. On the way they are sorted, as many at once as there are pixels, or a
+    million, 12 bytes each. Raises InvalidInputError where sizes do not fit."""
 
 def sci_gather(
     view: View,

@@ -49,8 +49,9 @@ class Method(StrEnum):
 
 
 class Loss(StrEnum):
-    """A robust loss."""
+    """What large residuals count; all but squares less."""
 
+    squares = "squares"
     huber = "huber"
     cauchy = "cauchy"
     tukey = "tukey"

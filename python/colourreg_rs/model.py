@@ -76,9 +76,14 @@ class Camera:
         object.__setattr__(self, "params", ordered)
         object.__setattr__(self, "width", int(self.width))
         object.__setattr__(self, "height", int(self.height))
-        _core.View.canonical(
-            self.model, self.width, self.height, self.vector, np.eye(3), np.zeros(3)
-        )  # the core's checks
+        self._canonical()  # the core's checks
+
+    def _canonical(self) -> _core.View:
+        return _core.View.canonical(self.model, self.width, self.height, self.vector, np.eye(3), np.zeros(3))
+
+    def check_focal(self) -> None:
+        """For cameras that people wrote: raises InvalidInputError for a focal length that none has, as one in mm."""
+        self._canonical().check_focal()
 
     @property
     def vector(self) -> FloatArray:

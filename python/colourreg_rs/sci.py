@@ -205,6 +205,25 @@ def render_sci(
     )
 
 
+def draw_points(cloud: PointCloud, view: View, *, splat: int = 1) -> tuple[Float32Array, Float32Array]:
+    """The plain picture of a cloud: each point a square of ``splat`` pixels (odd, 7 at most), the nearest in front.
+
+    For a quick look, and for what other programs' depth pictures are for: no surface is made of the points, so that far
+    ones shine through gaps, and the intensity is as the scanner gave it. :func:`render_sci` does the rest.
+
+    Returns depth (H, W), in the cloud's unit, and intensity (H, W), or the luminance where there is none, or 0; NaN
+    where no point is. Raises InvalidInputError.
+    """
+    values = _values(cloud, "intensity" if cloud.intensity is not None else "colour")
+    if values is None:
+        values = np.zeros(len(cloud), np.float32)
+    if splat == 1:
+        return _core.sci_picture(view.core, cloud.xyz, values)
+    buffer = _core.IndexBuffer(view.core)
+    buffer.add(cloud.xyz)
+    return buffer.draw(values, splat=splat)
+
+
 def points_of(sci: SCI, cloud: PointCloud, pixels: npt.NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
     """The points behind measured pixels (M, 2: column, row) and their true places in the SCI.
 

@@ -26,7 +26,8 @@ const REFINED: usize = 4;
 const HOPELESS: f64 = 30.0;
 
 /// The same before any step, where there are [`MANY`] points: residuals a hundred times those of the best start. P3P fits
-/// three points, so that a second view which fits all of them nearly as well has starts about as good as the first's.
+/// three points, so that a second view which fits all of them nearly as well has starts about as good as the first's. A
+/// start better than one sigma counts as one sigma: without noise the true view would rule out all others here.
 const NO_START: f64 = 1e4;
 /// See [`NO_START`].
 const MANY: usize = 10;

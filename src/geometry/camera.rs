@@ -145,7 +145,8 @@ impl Camera {
     }
 
     /// Refuses focal lengths that no camera has. Not a part of [`Camera::new`]: an iteration may pass through such values,
-    /// and a DLT matrix is of use without its parts having a meaning.
+    /// a DLT matrix is of use without its parts having a meaning, and what an estimate comes to has tests of its own. It is
+    /// for what people write.
     pub fn check_focal(&self) -> Result<()> {
         let (size, names) = (f64::from(self.width.max(self.height)), self.model.parameters());
         for (name, value) in names.iter().zip([self.fx, self.fy]) {

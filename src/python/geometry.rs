@@ -25,13 +25,16 @@ impl PyView {
     ) -> PyResult<Self> {
         let params = Input::<f64>::new(params, "params", &[None])?;
         let camera = Camera::new(Model::from_name(model)?, width, height, params.values()?)?;
-        camera.check_focal()?;
         let rotation = matrix::<3, 3>(rotation, "rotation")?;
         let pose = Pose::from_rotation_translation(
             Matrix3::from_fn(|i, j| rotation[i][j]),
             Vector3::from(vector::<3>(translation, "translation")?),
         )?;
         Ok(Self(geometry::View::new(camera, pose)))
+    }
+
+    fn check_focal(&self) -> PyResult<()> {
+        Ok(self.0.camera.check_focal()?)
     }
 
     #[classmethod]

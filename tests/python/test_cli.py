@@ -19,6 +19,7 @@ from colourreg_rs.register import RegisterOptions, register_photo
 
 CAMERA = Camera("OPENCV", 600, 400, {"fx": 500.0, "fy": 500.0, "cx": 299.5, "cy": 199.5, "k1": -0.04})
 REGISTER = ["register", "scan.laz", "photo.png", "--points", "points.csv", "--camera", "camera.json"]
+START = ["--method", "sci", "--init", "registration.json", "--out", "x.json"]
 POSE = Pose.looking_at([500_000.0, 5_800_000.0, 102.0], [500_001.0, 5_800_010.0, 103.0])
 
 
@@ -194,6 +195,8 @@ def test_info(job):
         ([*REGISTER, "--out", "x.json", "--free", "pose,zoom"], "colourreg: `zoom`", "camera of model OPENCV"),
         ([*REGISTER, "--out", "x.json", "--prior", "fx=500+-1"], "colourreg: `fx`", "is not free"),
         ([*REGISTER, "--out", "x.json", "--method", "dlt", "--distortion", "k9"], "colourreg: a DLT", "'k9'"),
+        ([*REGISTER, "--out", "x.json", "--sigma", "1e5"], "colourreg: --sigma 100000", "0 to 10000"),
+        (["register", "scan.laz", "photo.png", *START, "--free", "pose,zoom"], "colourreg: `zoom`", "camera of model"),
         (["evaluate", "registration.json", "twin.json", "--points", "points.csv"], "belong to one photo", "2 views"),
         (["evaluate", "registration.json", "--cloud", "nowhere.ply"], "nowhere.ply", "finite coordinates"),
         (["sci", "nowhere.ply", "--view", "registration.json", "--out", "x"], "nowhere.ply", "finite coordinates"),

@@ -244,6 +244,7 @@ def test_focal_lengths():
         {"focal_35mm": 24, "focal_length_mm": 24.0, "sensor_width_mm": 9.0}, 6000, 4000
     ) == pytest.approx(4000)
     assert focal_in_pixels({}, 6000, 4000) is None
+    assert focal_in_pixels({"focal_35mm": 1}, 600, 400) is None
 
 
 def test_real_photos(data_dir):

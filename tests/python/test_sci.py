@@ -10,7 +10,7 @@ import pytest
 
 from colourreg_rs import Camera, InvalidInputError, PointCloud, Pose, View, _core
 from colourreg_rs.io.sci import write_sci
-from colourreg_rs.sci import points_of, render_sci, with_size
+from colourreg_rs.sci import draw_points, points_of, render_sci, with_size
 
 PINHOLE = Camera("PINHOLE", 240, 180, {"fx": 220.0, "fy": 220.0, "cx": 118.0, "cy": 91.0})
 TERMS = {"k1": -0.12, "k2": 0.03, "p1": 1e-3, "p2": -5e-4}
@@ -88,6 +88,23 @@ def test_splats_are_squares_about_the_points(model, rng):
     assert np.abs(_core.project(view.core, xyz)[1] / sci.depth[sci.measured] - 1).max() < 1e-6
     with pytest.raises(InvalidInputError, match="odd"):
         render_sci(cloud, view, splat=2)
+
+
+@pytest.mark.parametrize("splat", [1, 3])
+@pytest.mark.parametrize("model", ["OPENCV", "EQUIRECTANGULAR"])
+def test_a_plain_picture_shows_the_nearest_point_of_each_square(model, splat, rng):
+    cloud = box(rng, 5_000)
+    view = View("v", None, CAMERAS[model], Pose.from_centre(np.eye(3), [0.3, -0.2, 0.1]))
+    depth, intensity = draw_points(cloud, view, splat=splat)
+    sci = render_sci(cloud, view, splat=splat, fill=0, exponents=(0.0, 0.0))
+    assert np.allclose(depth, sci.depth, rtol=1e-6, equal_nan=True)
+    assert np.array_equal(intensity, sci.raw, equal_nan=True) and 0.01 < np.isfinite(intensity).mean() < 0.99
+    # Without intensities the luminance, without colours nothing.
+    grey = np.full((len(cloud), 3), 7, np.uint16)
+    assert set(np.unique(draw_points(PointCloud(cloud.xyz, rgb=grey), view)[1]).round(3)[:1]) == {7.0}
+    assert np.nanmax(np.abs(draw_points(PointCloud(cloud.xyz), view)[1])) == 0.0
+    with pytest.raises(InvalidInputError, match="odd"):
+        draw_points(cloud, view, splat=2)
 
 
 def test_intensity_at_the_centres_does_not_follow_the_points_about(rng):

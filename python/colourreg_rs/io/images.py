@@ -139,12 +139,14 @@ def focal_in_pixels(exif: Mapping[str, Any], width: int, height: int) -> float |
     resolution of the sensor is given too, and agrees with it to 10 %, or stands alone, it is used: it is not rounded.
     """
     equivalent, resolved = exif.get("focal_35mm"), None
+
+    def possible(focal: float) -> float | None:
+        return focal if 0.2 < focal / max(width, height) < 50 else None
+
     if equivalent:
-        equivalent = float(equivalent) * math.hypot(width, height) / _FILM_DIAGONAL
+        equivalent = possible(float(equivalent) * math.hypot(width, height) / _FILM_DIAGONAL)
     if exif.get("focal_length_mm") and exif.get("sensor_width_mm"):
-        resolved = float(exif["focal_length_mm"]) / float(exif["sensor_width_mm"]) * max(width, height)
-        if not 0.2 < resolved / max(width, height) < 50:
-            resolved = None
+        resolved = possible(float(exif["focal_length_mm"]) / float(exif["sensor_width_mm"]) * max(width, height))
     if resolved and (not equivalent or abs(resolved / equivalent - 1) < 0.1):
         return resolved
     return equivalent or None

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import FileError, InvalidInputError
-from ..model import ControlPoint, Role
+from ..model import ControlPoint, FloatArray, Role
 from .atomic import read_bytes, write_text
 
 REQUIRED = ("name", "X", "Y", "Z", "x", "y")
@@ -96,10 +96,9 @@ def write_points(path: str | Path, points: Iterable[ControlPoint]) -> None:
     write_text(path, out.getvalue())
 
 
-def _numbers(values: Iterable[float]) -> list[str]:
-    for value in values:
-        if not abs(value) < LARGEST:
-            raise InvalidInputError(f"{value:g} is too large for a coordinate: such a file could not be read")
+def _numbers(values: FloatArray) -> list[str]:
+    if not (np.abs(values) < LARGEST).all():
+        raise InvalidInputError(f"{values.tolist()}: a number is not finite or too large, and could not be read again")
     return [repr(float(v)) for v in values]
 
 

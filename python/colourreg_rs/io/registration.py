@@ -153,7 +153,9 @@ def _validated(path: Path, part: type[Part], data: Any) -> Part:
 
 
 def _camera(part: CameraPart) -> Camera:
-    return Camera(part.model, part.width, part.height, part.params)
+    camera = Camera(part.model, part.width, part.height, part.params)
+    camera.check_focal()
+    return camera
 
 
 def _view(path: Path, place: str, part: ViewPart, number: int) -> View:

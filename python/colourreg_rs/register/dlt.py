@@ -10,7 +10,7 @@ import numpy as np
 from .. import _core
 from ..accuracy.doubts import contradictions
 from ..accuracy.view_adjustment import PointSigmas, adjust_control
-from ..errors import DegenerateError, InvalidInputError, NotConvergedError
+from ..errors import DegenerateError, NotConvergedError
 from ..evaluate import evaluate_view
 from ..io.images import PhotoInfo
 from ..model import DLT_DISTORTION_NAMES, ControlPoint, Covariance, Registration, View
@@ -25,11 +25,6 @@ _DLT_STARTS = {11: "11 parameters (h34 = 1)", 12: "12 elements (singular vector,
 def by_dlt(photo: Path, info: PhotoInfo, control: Sequence[ControlPoint], options: RegisterOptions) -> RegisterResult:
     """Direct Linear Transformation: nothing is known of the camera. Eleven parameters and twelve under a condition are
     the same family of views: they differ in the approximate values, from which both are adjusted."""
-    unknown = sorted(set(options.distortion) - set(DLT_DISTORTION_NAMES))
-    if unknown:
-        raise InvalidInputError(
-            f"a DLT has no distortion term {', '.join(unknown)}; it takes {', '.join(DLT_DISTORTION_NAMES)}"
-        )
     sigmas = PointSigmas.of(control, options.sigma_xy, options.sigma_xyz)
     result = _core.estimate_dlt(
         np.stack([p.xyz for p in control]),

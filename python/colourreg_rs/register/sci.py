@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from .. import _core
 from ..errors import InvalidInputError, NotConvergedError
 from ..io.clouds import read_cloud
 from ..io.images import read_photo
@@ -21,6 +22,7 @@ def by_sci(cloud: Path, photo: Path, start: StartingView, options: RegisterOptio
     free = options.free or ("pose",)
     given = start.view(photo)
     priors = tuple(parse_prior(text) for text in options.priors)
+    _core.check_parameters(given.core, free=list(free), priors=list(priors))
     points = read_cloud(cloud)
     found = register_sci(points, read_photo(photo).pixels, given, SciOptions(free=free, priors=priors))
     if not found.trusted:

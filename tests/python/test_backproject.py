@@ -390,3 +390,10 @@ def test_sigmas_of_points_made_hold_the_errors(scene, wrong):
     assert 0.68 < one < 0.80 and two > 0.945 and three > 0.975
     one, two, three = extended.within
     assert 0.68 < one < 0.80 and two > 0.89 and three > 0.92
+
+
+@pytest.mark.parametrize("wrong", [{"pixel_sigma": 1e30}, {"depth_sigma": -1.0}, {"radius": float("nan")}])
+def test_options_that_mean_nothing_are_refused_at_once(wrong):
+    (name,) = wrong
+    with pytest.raises(InvalidInputError, match=f"{name.replace('_', ' ')} of .* is not possible: .* to "):
+        BackprojectOptions(**wrong)

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from colourreg_rs import Camera, ControlPoint, PointCloud, Pose, Registration, View, _core
+from colourreg_rs import Camera, ControlPoint, FileError, PointCloud, Pose, Registration, View, _core
+from colourreg_rs.io.atomic import write_text
 from colourreg_rs.io.clouds import open_cloud, read_cloud, write_cloud
 from colourreg_rs.io.images import read_photo, write_image
 from colourreg_rs.io.points import read_points, write_points
@@ -265,6 +268,15 @@ def test_what_cannot_be_written_is_said_before_the_work(job, arguments):
     done = colourreg(*arguments, cwd=job)
     assert done.returncode == 1 and done.stderr.count("\n") == 1
     assert sorted(job.iterdir()) == before
+
+
+def test_a_write_protected_output_is_not_replaced(job, tmp_path, monkeypatch):
+    target = tmp_path / "x.json"
+    write_text(target, "kept")
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != target)  # whoever runs the tests may be root
+    with pytest.raises(FileError, match="write-protected; permit writing"):
+        write_text(target, "new")
+    assert target.read_text() == "kept" and list(tmp_path.iterdir()) == [target]
 
 
 def test_pictures_of_several_views_stay_in_their_folder(job, tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -236,3 +237,18 @@ def test_a_robust_loss_says_that_nothing_is_adjusted(folder, rng):
     assert "adjustment" not in result.view.statistics
     assert any("nothing is adjusted" in n and "take no part" in n for n in result.notes)
     assert "nothing is adjusted" in result.text()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"method": "magic"}, "no method 'magic': dlt, resection, sci"),
+        ({"loss": "absolute"}, "no loss 'absolute': squares, huber, cauchy, tukey"),
+        ({"dlt_parameters": 13}, "13 parameters is not possible: 11 or 12"),
+        ({"sigma_xy": -1.0}, "--sigma -1 is not possible: 0 to 10000"),
+        ({"sigma_xyz": float("nan")}, "--sigma-xyz nan is not possible"),
+    ],
+)
+def test_options_that_mean_nothing_are_refused_at_once(wrong, words):
+    with pytest.raises(InvalidInputError, match=re.escape(words)):
+        RegisterOptions(**wrong)

@@ -26,11 +26,9 @@ impl Block {
     pub fn new() -> Self {
         Self { x: [f64::NAN; LANES], y: [f64::NAN; LANES], depth: [f64::NAN; LANES] }
     }
-}
 
-impl Block {
     /// The first results, as many as there is room for.
-    pub(super) fn put(&self, xy: &mut [[f64; 2]], depth: &mut [f64]) {
+    fn put(&self, xy: &mut [[f64; 2]], depth: &mut [f64]) {
         for (i, (xy, d)) in xy.iter_mut().zip(depth).enumerate() {
             *xy = [self.x[i], self.y[i]];
             *d = self.depth[i];
@@ -38,9 +36,12 @@ impl Block {
     }
 
     /// The same past the caches, which large results do not fit into anyway: otherwise what was there before is fetched
-    /// for nothing. To be followed by a fence. Of memory that does not lie as large arrays do nothing is asked.
+    /// for nothing. Of memory that does not lie as large arrays do nothing is asked.
+    ///
+    /// # Safety
+    /// A fence has to follow before anything else is done with the slices: until then others need not see the stores.
     #[cfg(target_arch = "x86_64")]
-    pub(super) fn put_past_caches(&self, xy: &mut [[f64; 2]], depth: &mut [f64]) {
+    unsafe fn put_past_caches(&self, xy: &mut [[f64; 2]], depth: &mut [f64]) {
         use std::arch::x86_64::{_mm_loadu_pd, _mm_set_pd, _mm_stream_pd, _mm_stream_si64};
         let aligned = |address: usize| address.is_multiple_of(16);
         let n = depth.len();
@@ -66,14 +67,12 @@ impl Block {
     }
 }
 
+/// After it, others see what was put past the caches.
 #[cfg(target_arch = "x86_64")]
-impl Block {
-    /// After it, others see what was put past the caches.
-    #[allow(unused_unsafe, reason = "newer compilers know that it is safe")]
-    pub(super) fn fence() {
-        // SAFETY: every processor of this kind has it.
-        unsafe { std::arch::x86_64::_mm_sfence() };
-    }
+#[allow(unused_unsafe, reason = "newer compilers know that it is safe")]
+fn fence() {
+    // SAFETY: every processor of this kind has it.
+    unsafe { std::arch::x86_64::_mm_sfence() };
 }
 
 impl Default for Block {
@@ -89,7 +88,7 @@ pub(crate) enum Registers {
     /// Those that all processors of the kind have.
     Any,
     Avx2,
-    /// With the parts that all processors with such registers have had but the first.
+    /// AVX-512 F with VL, DQ and BW, which all processors with such registers have had but Knights Landing and Knights Mill.
     Avx512,
 }
 
@@ -128,6 +127,26 @@ impl BlockProjector {
             centre: view.pose.centre.into(),
             #[cfg(target_arch = "x86_64")]
             registers: Registers::here(),
+        }
+    }
+
+    /// Projects any number of points into arrays of as many rows: past the caches if the results of all threads together
+    /// are larger than these are, where the processor can do that.
+    pub(super) fn fill(&self, points: &[[f64; 3]], xy: &mut [[f64; 2]], depth: &mut [f64], past_caches: bool) {
+        let mut block = Block::new();
+        for ((points, xy), depth) in points.chunks(LANES).zip(xy.chunks_mut(LANES)).zip(depth.chunks_mut(LANES)) {
+            self.project(points, &mut block);
+            #[cfg(target_arch = "x86_64")]
+            if past_caches {
+                // SAFETY: the fence is below.
+                unsafe { block.put_past_caches(xy, depth) };
+                continue;
+            }
+            block.put(xy, depth);
+        }
+        #[cfg(target_arch = "x86_64")]
+        if past_caches {
+            fence();
         }
     }
 
@@ -245,18 +264,40 @@ mod tests {
             (block.x[i], block.y[i], block.depth[i]) = (i as f64, -(i as f64), 0.5 + i as f64);
         }
         let mut room = vec![0.0_f64; 4 * LANES];
-        for (first, n) in [(0, LANES), (1, LANES), (2, 7), (3, 8), (1, 1), (0, 0)] {
+        let even = room.as_ptr().align_offset(16);
+        // Where xy and the depths begin, in numbers behind a multiple of 16 bytes, and how many rows there are. Only with an
+        // even first one the stores go past the caches; with an odd second one, one depth is stored before the pairs.
+        let mut ways = [false; 3];
+        for (first_xy, first_depth, n) in [
+            (0, 0, LANES),
+            (0, 1, LANES),
+            (0, 0, 7),
+            (0, 1, 7),
+            (0, 1, 8),
+            (0, 1, 1),
+            (0, 1, 0),
+            (0, 0, 0),
+            (1, 0, LANES),
+            (1, 0, 8),
+            (1, 1, 7),
+        ] {
             room.fill(7.0);
-            let (xy, depth) = room.split_at_mut(2 * LANES + 6);
-            let xy = &mut xy[first..first + 2 * n].as_chunks_mut::<2>().0[..n];
-            block.put_past_caches(xy, &mut depth[first..first + n]);
-            Block::fence();
+            let (xy, depth) = room[even..].split_at_mut(2 * LANES + 6);
+            let xy = &mut xy[first_xy..first_xy + 2 * n].as_chunks_mut::<2>().0[..n];
+            let depth = &mut depth[first_depth..first_depth + n];
+            assert_eq!(xy.as_ptr().addr() % 16, 8 * first_xy);
+            assert_eq!(depth.as_ptr().addr() % 16, 8 * first_depth);
+            ways[if first_xy == 1 { 2 } else { first_depth }] |= n > 1;
+            // SAFETY: the fence follows.
+            unsafe { block.put_past_caches(xy, depth) };
+            fence();
             let (mut wanted_xy, mut wanted_depth) = (vec![[0.0; 2]; n], vec![0.0; n]);
             block.put(&mut wanted_xy, &mut wanted_depth);
-            assert_eq!((&xy[..], &depth[first..first + n]), (&wanted_xy[..], &wanted_depth[..]));
+            assert_eq!((&xy[..], &depth[..]), (&wanted_xy[..], &wanted_depth[..]));
             let others = room.iter().filter(|&&v| v == 7.0).count();
             let sevens = wanted_xy.as_flattened().iter().chain(&wanted_depth).filter(|&&v| v == 7.0).count();
             assert_eq!(others - sevens, room.len() - 3 * n, "written beside the slices");
         }
+        assert_eq!(ways, [true; 3]);
     }
 }

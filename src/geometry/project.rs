@@ -3,7 +3,7 @@
 use nalgebra::Matrix3;
 use rayon::prelude::*;
 
-use super::block::{Block, BlockProjector, LANES};
+use super::block::{BlockProjector, LANES};
 use super::camera::MAX_PARAMS;
 use super::pose::skew_matrix;
 use super::view::View;
@@ -13,7 +13,6 @@ use crate::memory::fresh;
 /// Points per task of the scheduler.
 const TASK: usize = 32 * LANES;
 /// From this many points on results are larger than caches are.
-#[cfg(target_arch = "x86_64")]
 const MANY: usize = 1 << 20;
 
 /// World points to pixels and depths. What the camera cannot see is NaN in both.
@@ -39,27 +38,14 @@ pub fn project_into(view: &View, xyz: &[[f64; 3]], xy: &mut [[f64; 2]], depth: &
 }
 
 fn fill(view: &View, xyz: &[[f64; 3]], xy: &mut [[f64; 2]], depth: &mut [f64]) {
-    let projector = BlockProjector::new(view);
-    #[cfg(target_arch = "x86_64")]
-    let many = xyz.len() >= MANY;
-    xyz.par_chunks(TASK).zip(xy.par_chunks_mut(TASK)).zip(depth.par_chunks_mut(TASK)).for_each(
-        |((points, xy), depth)| {
-            let mut block = Block::new();
-            for ((points, xy), depth) in points.chunks(LANES).zip(xy.chunks_mut(LANES)).zip(depth.chunks_mut(LANES)) {
-                projector.project(points, &mut block);
-                #[cfg(target_arch = "x86_64")]
-                if many {
-                    block.put_past_caches(xy, depth);
-                    continue;
-                }
-                block.put(xy, depth);
-            }
-            #[cfg(target_arch = "x86_64")]
-            if many {
-                Block::fence();
-            }
-        },
-    );
+    fill_past_caches_from(MANY, view, xyz, xy, depth);
+}
+
+/// Past the caches from `many` points on.
+fn fill_past_caches_from(many: usize, view: &View, xyz: &[[f64; 3]], xy: &mut [[f64; 2]], depth: &mut [f64]) {
+    let (projector, past_caches) = (BlockProjector::new(view), xyz.len() >= many);
+    let tasks = xyz.par_chunks(TASK).zip(xy.par_chunks_mut(TASK)).zip(depth.par_chunks_mut(TASK));
+    tasks.for_each(|((points, xy), depth)| projector.fill(points, xy, depth, past_caches));
 }
 
 /// Pixels to unit directions in the world frame; NaN where nothing of the valid field is imaged.
@@ -113,5 +99,47 @@ impl View {
             }
         }
         Some(ViewJacobian { xy: projection.xy, d_xyz, d_pose, d_params: projection.d_params })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector3;
+
+    use super::super::{Camera, Model, Pose, rotation_exp};
+    use super::*;
+
+    #[test]
+    fn many_points_and_few_give_the_same_bits_wherever_the_arrays_begin_and_end() {
+        let camera = Camera::new(Model::OpenCv, 600, 400, &[330.0, 330.0, 299.5, 199.5, -0.1, 0.02, 1e-3, 0.0, 0.0]);
+        let pose = Pose { rotation: rotation_exp(&Vector3::new(0.2, -0.4, 0.1)), centre: Vector3::new(0.5, 0.2, -1.0) };
+        let view = View::new(camera.unwrap(), pose);
+        let noise = |i: usize| 20.0 * ((i as f64 * 12.9898).sin() * 43758.5453).fract() - 1.0;
+        let xyz: Vec<[f64; 3]> = (0..TASK + LANES + 3).map(|i| [0, 1, 2].map(|k| noise(3 * i + k))).collect();
+        // The view sees some of the points, and not all.
+        let seen = xyz.iter().filter(|p| view.project(p).is_some()).count();
+        assert!(seen > 1000 && xyz.len() - seen > 1000, "{seen}");
+        for n in [0, 1, 2, LANES - 1, LANES + 1, 3001, TASK, TASK + LANES + 3] {
+            let (mut wanted_xy, mut wanted_depth) = (vec![[0.0; 2]; n], vec![0.0; n]);
+            fill_past_caches_from(usize::MAX, &view, &xyz[..n], &mut wanted_xy, &mut wanted_depth);
+            // Beginnings in numbers behind a multiple of 16 bytes.
+            for (first_xy, first_depth) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
+                let mut room = [vec![7.0_f64; 2 * n + 4], vec![7.0_f64; n + 4]];
+                let [before_xy, before_depth] =
+                    [room[0].as_ptr().align_offset(16) + first_xy, room[1].as_ptr().align_offset(16) + first_depth];
+                let [xy, depth] = &mut room;
+                let xy = &mut xy[before_xy..before_xy + 2 * n].as_chunks_mut::<2>().0[..n];
+                let depth = &mut depth[before_depth..before_depth + n];
+                fill_past_caches_from(0, &view, &xyz[..n], xy, depth);
+                let bits = |v: &[f64]| v.iter().map(|v| v.to_bits()).collect::<Vec<_>>();
+                let case = format!("{n} points, {first_xy} and {first_depth} numbers off");
+                assert!(bits(xy.as_flattened()) == bits(wanted_xy.as_flattened()), "xy of {case}");
+                assert!(bits(depth) == bits(&wanted_depth), "depths of {case}");
+                for (room, before, written) in [(&room[0], before_xy, 2 * n), (&room[1], before_depth, n)] {
+                    let beside = room[..before].iter().chain(&room[before + written..]);
+                    assert!(beside.into_iter().all(|&v| v == 7.0), "written beside the arrays: {case}");
+                }
+            }
+        }
     }
 }

@@ -12,14 +12,16 @@ use rayon::prelude::*;
 use super::zbuffer::{Grid, Located, fetch};
 use crate::error::{Error, Result};
 use crate::geometry::{Block, BlockProjector, Frustum, LANES, View};
-use crate::memory::fresh;
+use crate::memory::zeros;
 
 /// Points per task: those that fall into one tile are some lines of memory, and all stay in a processor's own cache.
 const TASK: usize = 64 * LANES;
 /// Cells of a tile: with depth and value half a megabyte, which stays in a processor's own cache.
 const TILE: usize = 1 << 16;
-/// Points that are sorted before tiles are drawn, at least; beyond that as many as the picture has pixels.
+/// Points that are sorted before tiles are drawn, at least; beyond that as many as the picture has pixels, up to a most: the
+/// tasks' ends of tiles would grow with the square of the pixels.
 const ROUND: usize = 64 * TASK;
+const MOST: usize = 1 << 26;
 /// Tasks whose points of a tile are asked for before their turn.
 const AHEAD: usize = 4;
 
@@ -38,9 +40,9 @@ pub fn picture(view: &View, xyz: &[[f64; 3]], values: &[f32]) -> Result<(Vec<f32
     let grid = Grid::new(view)?;
     let pixels = grid.width * grid.height;
     // The depths are inverse ones until the end.
-    let (mut depth, mut value) = (fresh::<f32>(pixels), fresh::<f32>(pixels));
-    let at_once = pixels.max(ROUND).next_multiple_of(TASK);
-    let mut sorted = Sorted::new(&grid, xyz.len().min(at_once));
+    let (mut depth, mut value) = (zeros::<f32>(pixels, "a picture")?, zeros::<f32>(pixels, "a picture")?);
+    let at_once = pixels.clamp(ROUND, MOST).next_multiple_of(TASK);
+    let mut sorted = Sorted::new(&grid, xyz.len().min(at_once))?;
     let rounds = xyz.len().div_ceil(at_once).max(1);
     for round in 0..rounds {
         let part = round * at_once..((round + 1) * at_once).min(xyz.len());
@@ -61,10 +63,10 @@ struct Sorted {
 }
 
 impl Sorted {
-    fn new(grid: &Grid, points: usize) -> Self {
+    fn new(grid: &Grid, points: usize) -> Result<Self> {
         let tiles = grid.len().div_ceil(TILE);
-        let ends = vec![0; points.div_ceil(TASK) * (tiles + 1)];
-        Self { grid: *grid, tiles, tasks: 0, records: fresh(points), ends }
+        let ends = zeros(points.div_ceil(TASK) * (tiles + 1), "a list of tiles")?;
+        Ok(Self { grid: *grid, tiles, tasks: 0, records: zeros(points, "a list of points")?, ends })
     }
 
     fn sort(&mut self, view: &View, xyz: &[[f64; 3]], values: &[f32]) {

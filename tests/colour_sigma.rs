@@ -2,8 +2,10 @@
 #![allow(clippy::unwrap_used, missing_docs, reason = "a test")]
 
 use colourreg::adjustment::*;
+use colourreg::colour::{Limits, VisibilityMap};
 use colourreg::estimation::FreeSet;
 use colourreg::geometry::{Camera, Model, Pose, View, rotation_exp};
+use colourreg::render::{DepthBuffer, Footprint};
 use nalgebra::Vector3;
 
 struct Uniform(u64);
@@ -193,4 +195,34 @@ fn what_is_not_seen_has_no_figure_and_a_slanted_surface_a_larger_one() {
     assert!(out[1].is_nan() && out[0] < out[2]);
     assert!(sigma.fill(&[front], Slopes::default(), &mut out).is_err());
     assert!(SurfaceSigma::new(&view, &covariance, -1.0, ObjectNoise::Isotropic(0.0)).is_err());
+}
+
+#[test]
+fn planes_of_a_camera_that_looks_elsewhere_are_refused() {
+    let views = [Model::Pinhole, Model::Equirectangular].map(view);
+    let planes = views.each_ref().map(|view| {
+        let buffer = DepthBuffer::new(*view).unwrap();
+        buffer.add(&points(view, 1000, &mut Uniform(5)));
+        VisibilityMap::new(buffer, &Footprint::default(), Limits::default()).unwrap().planes()
+    });
+    let looks = ["forward", "around"];
+    for (this, view) in views.iter().enumerate() {
+        let covariance = estimated(view, &FreeSet::pose(view.camera.model()), &mut Uniform(3));
+        let sigma = SurfaceSigma::new(view, &covariance, 0.5, ObjectNoise::Isotropic(0.002)).unwrap();
+        let xyz = points(view, 300, &mut Uniform(6));
+        let mut out = vec![0.0f32; 300];
+        for other in 0..2 {
+            let slopes = Slopes { normals: None, planes: Some(&planes[other]) };
+            let found = [sigma.fill(&xyz, slopes, &mut out), sigma.fill_where(&xyz, slopes, &[1; 300], 1, &mut out)];
+            for found in found {
+                if other == this {
+                    found.unwrap();
+                } else {
+                    let wanted = format!("the planes are of another view, whose camera looks {}", looks[other]);
+                    assert_eq!(found.unwrap_err().to_string(), wanted);
+                }
+            }
+        }
+        assert!(out.iter().all(|s| *s > 0.0));
+    }
 }

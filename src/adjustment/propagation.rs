@@ -104,6 +104,18 @@ impl SurfaceSigma {
         self.faces.get_or_init(|| made)
     }
 
+    /// The tables, and an error where the planes lie on other faces: those of another camera would be taken for these.
+    fn faces_for(&self, slopes: Slopes<'_>) -> Result<&[Face]> {
+        let faces = self.faces();
+        match slopes.planes.map(LocalPlanes::count) {
+            Some(count) if count != faces.len() => {
+                let other = if count == 1 { "forward" } else { "around" };
+                Err(Error::invalid(format!("the planes are of another view, whose camera looks {other}")))
+            }
+            _ => Ok(faces),
+        }
+    }
+
     /// One sigma per axis on the surface, in the world's unit; NaN where the view does not see the point. A normal
     /// without length counts as none.
     pub fn exact(&self, xyz: &[f64; 3], normal: Option<&[f64; 3]>) -> f64 {
@@ -144,7 +156,7 @@ impl SurfaceSigma {
                 out.len()
             )));
         }
-        let faces = self.faces();
+        let faces = self.faces_for(slopes)?;
         out.par_chunks_mut(BLOCKS * BLOCK).enumerate().for_each(|(task, out)| {
             let (mut first, mut room) = (task * BLOCKS * BLOCK, Room::new());
             for out in out.chunks_mut(BLOCK) {
@@ -176,7 +188,7 @@ impl SurfaceSigma {
                 out.len()
             )));
         }
-        let faces = self.faces();
+        let faces = self.faces_for(slopes)?;
         out.par_chunks_mut(BLOCKS * BLOCK).enumerate().for_each(|(task, out)| {
             let first = task * BLOCKS * BLOCK;
             let mut room = Room::new();
@@ -207,7 +219,9 @@ impl SurfaceSigma {
                     }
                 }
             }
-            scatter(&mut fill, &kept[..n], &points[..n], slopes.normals.map(|_| &turned[..n]), out);
+            if n > 0 {
+                scatter(&mut fill, &kept[..n], &points[..n], slopes.normals.map(|_| &turned[..n]), out);
+            }
         });
         Ok(())
     }

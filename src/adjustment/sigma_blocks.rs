@@ -71,7 +71,7 @@ impl Room {
     }
 }
 
-/// One sigma per axis on the surface for up to [`BLOCK`] points. The room is for this sigma alone.
+/// One sigma per axis on the surface for up to [`BLOCK`] points. Planes have as many faces as the tables.
 pub(super) fn fill_block(
     sigma: &SurfaceSigma,
     faces: &[Face],
@@ -197,7 +197,8 @@ fn fill_block_on<const SEVERAL: bool>(
             }
         }
     }
-    let table = |i: usize| if SEVERAL { faces.get(usize::from(face[i])).unwrap_or(only) } else { only };
+    let number = |i: usize| if SEVERAL { usize::from(face[i]) } else { 0 };
+    let table = |i: usize| if SEVERAL { faces.get(number(i)).unwrap_or(only) } else { only };
 
     // Rays with unit depth. Loops over whole blocks, however many points there are: their length is known.
     for i in 0..BLOCK {
@@ -206,11 +207,11 @@ fn fill_block_on<const SEVERAL: bool>(
         v[i] = ray[1][i] * w[i];
     }
     // Places on the surfaces' planes.
-    let planes = slopes.planes.filter(|planes| planes.count() == faces.len());
+    let planes = slopes.planes;
     if let Some(planes) = planes {
         if SEVERAL {
             for i in 0..n {
-                cell[i] = planes.face(usize::from(face[i])).cell(u[i], v[i], w[i]);
+                cell[i] = planes.face(number(i)).cell(u[i], v[i], w[i]);
             }
         } else {
             let face = planes.face(0);
@@ -230,7 +231,7 @@ fn fill_block_on<const SEVERAL: bool>(
     for i in 0..n {
         // The memory has time to bring it; many at once it would refuse.
         if let Some(planes) = planes {
-            planes.face(usize::from(face[i])).fetch(cell[i]);
+            planes.face(number(i)).fetch(cell[i]);
         }
         let at = [places.cell[0][i] as usize, places.cell[1][i] as usize];
         part[i] = match if places.inside[i] { table(i).kind(at) } else { Cell::Outside } {
@@ -246,7 +247,7 @@ fn fill_block_on<const SEVERAL: bool>(
     if let Some(planes) = planes {
         for i in 0..n {
             if (slopes.normals.is_none() || !is_direction(pick(normal, i)))
-                && let Some(found) = planes.face(usize::from(face[i])).normal(cell[i], u[i], v[i], w[i])
+                && let Some(found) = planes.face(number(i)).normal(cell[i], u[i], v[i], w[i])
             {
                 (normal[0][i], normal[1][i], normal[2][i]) = (found[0], found[1], found[2]);
             }

@@ -3,6 +3,7 @@
 
 use super::propagation::{MIN_COSINE, ObjectNoise, Slopes, SurfaceSigma};
 use super::sigma_tables::{Cell, Face, weights};
+use crate::geometry::cube_face_of;
 
 /// Points per block: all steps' arrays stay in the innermost cache.
 pub(super) const BLOCK: usize = 128;
@@ -180,17 +181,9 @@ fn fill_block_on<const SEVERAL: bool>(
     // Onto the faces: axes are renamed so that the third is the depth.
     if SEVERAL {
         for i in 0..n {
-            let size = [ray[0][i].abs(), ray[1][i].abs(), ray[2][i].abs()];
-            let k = if size[0] >= size[1] && size[0] >= size[2] {
-                0
-            } else if size[1] >= size[2] {
-                1
-            } else {
-                2
-            };
-            let negative = ray[k][i] < 0.0;
-            face[i] = (2 * k + usize::from(negative)) as u8;
-            let table = &faces[usize::from(face[i])];
+            let number = cube_face_of(pick(ray, i));
+            face[i] = number as u8;
+            let table = &faces[number];
             for lanes in [&mut *ray, &mut *normal, &mut *beam, &mut *up] {
                 let q = table.axes.map(|a| lanes[a][i]);
                 (lanes[0][i], lanes[1][i], lanes[2][i]) = (q[0], q[1], table.sign * q[2]);

@@ -14,7 +14,7 @@ use rayon::prelude::*;
 
 use super::view_covariance::ViewCovariance;
 use crate::estimation::{MAX_FREE, Parameter};
-use crate::geometry::{Depth, View, forward_field};
+use crate::geometry::{CUBE_FACES, Depth, View, cube_face, forward_field};
 
 /// The largest relative difference of a sigma from the exact formula's at the places where a cell is compared.
 pub const TOLERANCE: f64 = 2e-3;
@@ -163,12 +163,10 @@ pub(super) fn make_faces(view: &View, covariance: &ViewCovariance, image_varianc
             let (low, high) = forward_field(view);
             vec![make([0, 1, 2], 1.0, low, high)]
         }
-        Depth::Range => (0..6)
-            .map(|f| {
-                let k = f / 2;
-                make([(k + 1) % 3, (k + 2) % 3, k], if f % 2 == 0 { 1.0 } else { -1.0 }, [-1.0; 2], [1.0; 2])
-            })
-            .collect(),
+        Depth::Range => {
+            let faces = (0..CUBE_FACES).map(cube_face);
+            faces.map(|(axes, sign)| make(axes, sign, [-1.0; 2], [1.0; 2])).collect()
+        }
     }
 }
 

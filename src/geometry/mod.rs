@@ -2,6 +2,7 @@
 
 mod block;
 mod camera;
+mod cube;
 mod field;
 mod fisheye;
 mod frustum;
@@ -17,6 +18,7 @@ mod view;
 pub(crate) use block::Registers;
 pub use block::{Block, BlockProjector, LANES};
 pub use camera::{Camera, Depth, MAX_PARAMS, Model, Projection};
+pub(crate) use cube::{CUBE_FACES, cube_face, cube_face_of};
 pub use field::forward_field;
 pub use frustum::Frustum;
 pub use pose::{Pose, rotation_exp, rotation_log, skew_matrix};

@@ -10,7 +10,7 @@ use super::plane_fit::LAYERS;
 use super::sample::Sample;
 use super::windows::Looks;
 use super::zbuffer::Grid;
-use crate::geometry::{Depth, Pose, View, forward_field};
+use crate::geometry::{CUBE_FACES, Depth, Pose, View, cube_face, cube_face_of, forward_field};
 use crate::memory::{Zeroed, fresh};
 
 /// By how much a point may lie off its plane, relative and in sigmas of a depth: one of its own cell, and any about it.
@@ -104,7 +104,7 @@ impl LocalPlanes {
         Self { pose: view.pose, faces, noise }
     }
 
-    /// The grid of a face: the only one, or in turn those of the axes x, −x, y, −y, z, −z.
+    /// The grid of a face: the only one, or one of the cube's.
     #[inline(always)]
     pub(crate) fn face(&self, number: usize) -> &Face {
         &self.faces[number]
@@ -118,13 +118,7 @@ impl LocalPlanes {
     /// The normal, of any length and sign, of the surface on which a point of the camera frame lies; `None` where no plane
     /// was found near it.
     pub fn normal(&self, q: [f32; 3]) -> Option<[f32; 3]> {
-        let number = if self.faces.len() == 1 {
-            0
-        } else {
-            let size = q.map(f32::abs);
-            let k = if size[0] >= size[1] && size[0] >= size[2] { 0 } else { 2 - usize::from(size[1] >= size[2]) };
-            2 * k + usize::from(q[k] < 0.0)
-        };
+        let number = if self.faces.len() == 1 { 0 } else { cube_face_of(q) };
         let face = &self.faces[number];
         let w = 1.0 / (face.sign as f32 * q[face.axes[2]]);
         let [u, v] = [0, 1].map(|k| q[face.axes[k]] * w);
@@ -168,12 +162,10 @@ fn prepared<'a>(view: &View, grid: Grid, samples: &'a [Sample]) -> (Looks<'a>, V
             let (low, high) = forward_field(view);
             vec![face([0, 1, 2], 1.0, low, high)]
         }
-        Depth::Range => (0..6)
-            .map(|f| {
-                let k = f / 2;
-                face([(k + 1) % 3, (k + 2) % 3, k], if f % 2 == 0 { 1.0 } else { -1.0 }, [-1.0; 2], [1.0; 2])
-            })
-            .collect(),
+        Depth::Range => {
+            let faces = (0..CUBE_FACES).map(cube_face);
+            faces.map(|(axes, sign)| face(axes, sign, [-1.0; 2], [1.0; 2])).collect()
+        }
     };
     (looks, faces)
 }

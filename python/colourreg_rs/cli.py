@@ -303,7 +303,7 @@ def register(
 
     chosen = RegisterOptions(
         method=method.value,
-        free=tuple(name.strip() for name in free.split(",") if name.strip()) if free else None,
+        free=tuple(name.strip() for name in free.split(",") if name.strip()) if free is not None else None,
         priors=tuple(prior or ()),
         sigma_xy=sigma,
         sigma_xyz=sigma_xyz,

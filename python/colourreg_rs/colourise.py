@@ -268,6 +268,7 @@ def colourise_file(
     cloud, out = Path(cloud), Path(out)
     with open_cloud(cloud) as reader, create_cloud(out, like=reader) as writer:
         views = load_views([Path(path) for path in registrations])
+        unlimited = _without_sigma(views, options)
         colouriser = Colouriser(views, options)
         # The first pass needs no photo: they are decoded behind it.
         with ThreadPoolExecutor(1, thread_name_prefix="colourreg-photos") as decoder:
@@ -287,8 +288,21 @@ def colourise_file(
         coloured=coloured,
         by_view={f"{i}: {view.name}": int(n) for i, (view, n) in enumerate(zip(views, counts, strict=True), start=1)},
         median_sigma=sigmas,
-        warnings=(*_doubts(views), *writer.warnings),
+        warnings=(*_doubts(views), *unlimited, *writer.warnings),
     )
+
+
+def _without_sigma(views: Sequence[View], options: ColouriseOptions) -> tuple[str, ...]:
+    """Warns of views that a limit of ColourSigma does not reach. Raises InvalidInputError if it reaches none."""
+    unknown = [view.name for view in views if view.covariance is None]
+    if options.max_sigma is None or not unknown:
+        return ()
+    if len(unknown) == len(views):
+        raise InvalidInputError(
+            "no view has a covariance, so that no ColourSigma is known to be limited: register again, or leave "
+            "--max-sigma out"
+        )
+    return (f"no covariance, hence no ColourSigma and no limit of it: {', '.join(unknown)}",)
 
 
 def _doubts(views: Sequence[View]) -> tuple[str, ...]:

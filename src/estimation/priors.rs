@@ -93,8 +93,15 @@ pub(super) fn resolve(prior: &Prior, free: &FreeSet, view: &View, origin: &Vecto
     let place = match free.position(name) {
         Some(place) => place,
         None if *sigma == 0.0 => {
-            // Held and not free: the value must still be one that the view has.
+            // Held and not free: the value must still be one that the view has, and that nothing else moves.
             FreeSet::parse(view.camera.model(), &[name])?;
+            if let Some(whole) = ["f", "aspect"].iter().find(|w| free.position(w).is_some())
+                && matches!(name.as_str(), "fx" | "fy")
+            {
+                return Err(Error::invalid(format!(
+                    "`{name}` cannot be held while `{whole}` is free, which moves it: hold `f`, or free fx and fy by name"
+                )));
+            }
             0
         }
         None => {

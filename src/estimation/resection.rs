@@ -173,6 +173,7 @@ pub fn resect_robust(
     (criterion, significance): (Criterion, f64),
 ) -> Result<Resection> {
     let task = Task::new(view, xyz, xy, options)?;
+    task.check_whole_pose()?;
     let o = task.all.part(&task.control);
     let radius = match criterion {
         Criterion::Threshold(t) => Some(t),
@@ -289,6 +290,19 @@ impl Task {
             )));
         }
         Ok(())
+    }
+
+    /// A search among blunders gives a whole pose: what of it is neither free nor held would be taken from the same points
+    /// and then counted as known.
+    fn check_whole_pose(&self) -> Result<()> {
+        let held = |name: &str| self.options.priors.iter().any(|p| p.name == name);
+        match POSE_NAMES.iter().find(|name| self.free.position(name).is_none() && !held(name)) {
+            None => Ok(()),
+            Some(name) => Err(Error::invalid(format!(
+                "`{name}` is neither free nor held, and the search for a view among blunders gives the whole pose: free \
+                 `pose`, and hold what is known of it by priors with sigma 0"
+            ))),
+        }
     }
 
     /// A view found without regard to held values, with them.

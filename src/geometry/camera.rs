@@ -157,8 +157,8 @@ impl Camera {
                     self.model.name(),
                     self.width,
                     self.height,
-                    FOCAL.0 * size,
-                    FOCAL.1 * size
+                    (FOCAL.0 * size).round(),
+                    (FOCAL.1 * size).round()
                 )));
             }
         }

@@ -99,7 +99,7 @@ def whole_photo_info(path: str | Path) -> PhotoInfo:
         info = _info(path, file, image)
         _refuse_mode(path, image.mode)
         if info.format == "JPEG":
-            image.draft(image.mode, (image.width // 8, image.height // 8))
+            image.draft(image.mode, (max(image.width // 8, 1), max(image.height // 8, 1)))
             image.load()
         elif info.format == "PNG":
             _check_png(path, file)

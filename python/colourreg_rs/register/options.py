@@ -17,6 +17,15 @@ LARGEST_SIGMA = 1e4
 LOSSES = ("squares", "huber", "cauchy", "tukey")
 
 
+#: What to do instead.
+_HINT = {
+    "distortion": "; distortion terms of a camera are named with --free",
+    "free": ", or use the method resection",
+    "prior": ", or use the method resection",
+    "loss": ", or use the method resection",
+}
+
+
 @dataclass(frozen=True)
 class RegisterOptions:
     """How a view is estimated. ``free`` of ``None``: the pose, and the focal length where no calibration is given.
@@ -40,6 +49,16 @@ class RegisterOptions:
             raise InvalidInputError(f"there is no method {self.method!r}: {', '.join(METHODS)}")
         if self.loss is not None and self.loss not in LOSSES:
             raise InvalidInputError(f"there is no loss {self.loss!r}: {', '.join(LOSSES)}")
+        if self.free is not None and not self.free:
+            raise InvalidInputError("nothing is named that is to be free: name pose, or leave the option out")
+        foreign: dict[Method, dict[str, object]] = {
+            "dlt": {"free": self.free, "prior": self.priors, "loss": self.loss},
+            "resection": {"distortion": self.distortion},
+            "sci": {"distortion": self.distortion, "loss": self.loss},
+        }
+        for name, value in foreign[self.method].items():
+            if value:
+                raise InvalidInputError(f"--{name} has no part in the method {self.method}: leave it out{_HINT[name]}")
         unknown = [name for name in self.distortion if name not in DLT_DISTORTION_NAMES]
         if unknown:
             known = ", ".join(DLT_DISTORTION_NAMES)

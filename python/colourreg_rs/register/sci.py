@@ -14,6 +14,8 @@ from .options import RegisterOptions, parse_prior
 from .result import RegisterResult
 from .start import StartingView
 
+POSE = {"rx", "ry", "rz", "cx_world", "cy_world", "cz_world"}
+
 
 def by_sci(cloud: Path, photo: Path, start: StartingView, options: RegisterOptions) -> RegisterResult:
     """From the approximate view, without control points. A result that cannot be trusted is an error."""
@@ -22,6 +24,11 @@ def by_sci(cloud: Path, photo: Path, start: StartingView, options: RegisterOptio
     free = options.free or ("pose",)
     given = start.view(photo)
     priors = tuple(parse_prior(text) for text in options.priors)
+    if not {"pose"} <= {*free} and not {*free} >= POSE:
+        raise InvalidInputError(
+            "method sci estimates the whole pose: name `pose` with --free, and hold what is known of it by --prior "
+            "NAME=VALUE±0"
+        )
     _core.check_parameters(given.core, free=list(free), priors=list(priors))
     points = read_cloud(cloud)
     found = register_sci(points, read_photo(photo).pixels, given, SciOptions(free=free, priors=priors))

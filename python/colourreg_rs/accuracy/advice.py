@@ -196,8 +196,9 @@ def _of_the_next_point(assessed: ViewAssessment) -> list[str]:
     before, after = first.mean_px
     if after < (1 - WORTHWHILE) * before:
         worst = first.largest_px
+        place = "over the photo" if assessed.surface is None else "on the surfaces, near ones too,"
         said.append(
-            f"The next control point would help most {first.where}: the expected error over the photo would go from "
+            f"The next control point would help most {first.where}: the expected error {place} would go from "
             f"{before:.2f} to {after:.2f} px in the mean, from {worst[0]:.2f} to {worst[1]:.2f} px at worst."
         )
     return said

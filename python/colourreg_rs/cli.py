@@ -371,7 +371,7 @@ def evaluate(
         typer.Argument(metavar="REG.json...", help="The registration; several are compared with each other too."),
     ],
     points: Annotated[
-        Path | None, typer.Option(help="More points (CSV); those that took no part are check points.")
+        Path | None, typer.Option(help="More points (CSV) of a single view; those that took no part are check points.")
     ] = None,
     cloud: Annotated[
         Path | None, typer.Option(help="The laser scan: compares it with the photos, and maps ColourSigma.")

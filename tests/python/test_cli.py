@@ -201,7 +201,7 @@ def test_info(job):
         ([*REGISTER, "--out", "x.json", "--free", "pose,f", "--prior", "fx=500±0"], "colourreg: `fx`", "hold `f`"),
         ([*REGISTER, "--out", "x.json", "--free", "f"], "points.csv", "neither free nor held"),
         (["register", "scan.laz", "photo.png", *START, "--free", "f"], "colourreg: method sci", "whole pose"),
-        ([*REGISTER, "--out", "x.json", "--sigma", "1e5"], "colourreg: --sigma 100000", "0 to 10000"),
+        ([*REGISTER, "--out", "x.json", "--sigma", "1e5"], "colourreg: --sigma 100000", "0.0001 to 10000"),
         (["register", "scan.laz", "photo.png", *START, "--free", "pose,zoom"], "colourreg: `zoom`", "camera of model"),
         (["evaluate", "registration.json", "twin.json", "--points", "points.csv"], "belong to one photo", "2 views"),
         (["evaluate", "registration.json", "--cloud", "nowhere.ply"], "nowhere.ply", "finite coordinates"),

@@ -249,7 +249,7 @@ def test_a_robust_loss_says_that_nothing_is_adjusted(folder, rng):
         ({"distortion": ("k1",)}, "--distortion has no part in the method resection"),
         ({"method": "sci", "loss": "huber"}, "--loss has no part in the method sci"),
         ({"dlt_parameters": 13}, "13 parameters is not possible: 11 or 12"),
-        ({"sigma_xy": -1.0}, "--sigma -1 is not possible: 0 to 10000"),
+        ({"sigma_xy": -1.0}, "--sigma -1 is not possible: 0.0001 to 10000"),
         ({"sigma_xyz": float("nan")}, "--sigma-xyz nan is not possible"),
     ],
 )

@@ -11,8 +11,8 @@ from ..model import DLT_DISTORTION_NAMES
 
 Method = Literal["dlt", "resection", "sci"]
 METHODS: tuple[Method, ...] = get_args(Method)
-#: Pixels, or metres: no measurement is worse.
-LARGEST_SIGMA = 1e4
+#: Pixels, or metres: no measurement is worse; and pixels: none in a photo is better.
+LARGEST_SIGMA, SMALLEST_SIGMA = 1e4, 1e-4
 
 LOSSES = ("squares", "huber", "cauchy", "tukey")
 
@@ -65,9 +65,9 @@ class RegisterOptions:
             raise InvalidInputError(f"a DLT has no distortion term {unknown[0]!r}: it takes any of {known}")
         if self.dlt_parameters not in (11, 12):
             raise InvalidInputError(f"a DLT of {self.dlt_parameters} parameters is not possible: 11 or 12")
-        for name, value in (("sigma", self.sigma_xy), ("sigma-xyz", self.sigma_xyz)):
-            if value is not None and not 0 <= value <= LARGEST_SIGMA:
-                raise InvalidInputError(f"--{name} {value:g} is not possible: 0 to {LARGEST_SIGMA:g}")
+        for name, value, least in (("sigma", self.sigma_xy, SMALLEST_SIGMA), ("sigma-xyz", self.sigma_xyz, 0.0)):
+            if value is not None and not least <= value <= LARGEST_SIGMA:
+                raise InvalidInputError(f"--{name} {value:g} is not possible: {least:g} to {LARGEST_SIGMA:g}")
         for text in self.priors:
             parse_prior(text)
 

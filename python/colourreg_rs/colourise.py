@@ -356,18 +356,19 @@ def _second_pass(
 ) -> tuple[int, npt.NDArray[np.int64], float | None]:
     """Colours and writes; gives the number of coloured points, those of each view, and the median sigma."""
     counts = np.zeros(len(colouriser.views) + 1, np.int64)
-    sigmas = SigmaHistogram()
+    sigmas, known = SigmaHistogram(), any(view.covariance is not None for view in colouriser.views)
     total = reader.n_points
 
     def write(item: tuple[CloudChunk, ColouredChunk]) -> None:
+        nonlocal counts
         chunk, new = item
         writer.write(chunk, rgb=new.rgb, source=new.source, sigma=new.sigma)
+        counts += np.bincount(new.source, minlength=len(counts))
+        if known:
+            sigmas.add(new.sigma)
         progress("colouring", chunk.start + len(chunk), total)
 
     with Behind(write) as writing:
         for chunk in prefetched(reader.chunks(colouriser.options.chunk_size)):
-            new = colouriser.colour(chunk.xyz, _normals(chunk), chunk.rgb)
-            counts += np.bincount(new.source, minlength=len(counts))
-            sigmas.add(new.sigma)
-            writing.put((chunk, new))
+            writing.put((chunk, colouriser.colour(chunk.xyz, _normals(chunk), chunk.rgb)))
     return int(counts[1:].sum()), counts[1:], sigmas.median()

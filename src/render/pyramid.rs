@@ -2,6 +2,8 @@
 
 use rayon::prelude::*;
 
+use crate::memory::fresh;
+
 use super::marks::MAX_REACH;
 use super::sample::Sample;
 use super::zbuffer::Grid;
@@ -55,7 +57,7 @@ impl Pyramid {
     /// One level up.
     pub fn coarsen(&mut self, samples: &[Sample]) {
         let (stride, rows) = (self.stride.div_ceil(2), self.rows.div_ceil(2));
-        let mut front = vec![0_u32; stride * rows];
+        let mut front = fresh::<u32>(stride * rows);
         let (old, old_stride, old_rows, base) = (&self.front, self.stride, self.rows, self.level == 0);
         let side = SIDE >> (self.level + 1);
         front.par_chunks_mut(stride).enumerate().for_each(|(y, row)| {

@@ -11,7 +11,6 @@ import contextlib
 import os
 import secrets
 import stat
-import sys
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -76,14 +75,6 @@ class AtomicFile:
             self.discard()
             raise
         _sync_folder(self._target.parent)
-
-    def settle(self, size: int) -> None:
-        """Has the system begin to bring the last ``size`` bytes to the disk, so that :meth:`commit` need not wait for
-        all of them at once."""
-        if sys.platform == "linux":
-            with contextlib.suppress(OSError):
-                # It says that nobody reads them soon; what comes of it for fresh bytes is that they are written.
-                os.posix_fadvise(self.file.fileno(), self.file.tell() - size, size, os.POSIX_FADV_DONTNEED)
 
     def discard(self) -> None:
         """Removes what was written; safe to call more than once."""

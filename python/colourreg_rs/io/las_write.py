@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,6 @@ import numpy.typing as npt
 
 from .. import _core
 from ..errors import FileError, InvalidInputError
-from ..overlap import Behind
 from . import laz
 from .atomic import AtomicFile
 from .clouds import (
@@ -27,6 +26,7 @@ from .clouds import (
     CloudChunk,
     CloudWriter,
 )
+from .direct import DirectWriter
 from .las import LasChunk, LasReader
 from .las_header import (
     FIRST_VERSION,
@@ -43,9 +43,6 @@ Bytes = npt.NDArray[np.uint8]
 
 #: Bytes of the file copied at a time.
 _COPY = 1 << 24
-
-#: Buffers for records: one is filled, one waits, one is being written.
-_BUFFERS = 3
 
 
 @dataclass(frozen=True)
@@ -116,8 +113,7 @@ class LasOutput(CloudWriter):
         self._splicer: laz.Splicer | None = None
         self._scheme: laz.Scheme | None = None
         self._splicing = False
-        self._buffers = [np.empty((0, 0), np.uint8)] * _BUFFERS
-        self._disk: Behind[Bytes] | None = None
+        self._direct: DirectWriter | None = None
         self._new_header = b""
 
     def write_records(
@@ -153,34 +149,14 @@ class LasOutput(CloudWriter):
         ]
         if self._splicing and chunk is not None and chunk.block is not None:
             self._write_block(chunk, chunk.block, columns)
-        else:
-            patched = self._patch(records(), columns)
-            if self._sink is not None:
-                self._sink.write(patched)
-            else:
-                # The system takes its time to copy: the next records are put together meanwhile.
-                if self._disk is None:
-                    self._disk = Behind(self._append)
-                self._disk.put(patched)
+        elif self._direct is not None:
+            patch = partial(_core.patch_records, records(), layout.split, layout.gap, columns)
+            self._direct.append(n * layout.length, lambda space: patch(space.reshape(n, layout.length)))
+        elif self._sink is not None:
+            patched = np.empty((n, layout.length), np.uint8)
+            _core.patch_records(records(), layout.split, layout.gap, columns, patched)
+            self._sink.write(patched)
         self._written += n
-
-    def _append(self, records: Bytes) -> None:
-        self._file.write(records.data)
-        self._out.settle(records.nbytes)
-
-    def _patch(self, records: Bytes, columns: list[tuple[int, Bytes]]) -> Bytes:
-        """The new records, in a buffer that a later call uses again."""
-        layout = self._layout
-        assert layout is not None
-        if not columns and not layout.gap and layout.length == records.shape[1]:
-            return records
-        buffer = self._buffers.pop(0)
-        if len(buffer) < len(records):
-            buffer = np.empty((len(records), layout.length), np.uint8)
-        self._buffers.append(buffer)
-        out = buffer[: len(records)]
-        _core.patch_records(records, layout.split, layout.gap, columns, out)
-        return out
 
     def _write_block(self, chunk: LasChunk, block: laz.Block, columns: list[tuple[int, Bytes]]) -> None:
         assert self._sink is not None and self._scheme is not None
@@ -229,8 +205,12 @@ class LasOutput(CloudWriter):
         if header.minor >= 4:
             struct.pack_into("<Q", raw, 247, header.n_points)
         self._new_header = bytes(raw)
-        self._file.write(self._new_header + body)
-        if self._scheme is not None:
+        if self._scheme is None:
+            self._direct = DirectWriter(self._file)
+            head = np.frombuffer(self._new_header + body, np.uint8)
+            self._direct.append(len(head), partial(np.copyto, src=head))
+        else:
+            self._file.write(self._new_header + body)
             self._sink = laz.LazSink(self.path, self._file, self._scheme, self._splicing)
 
     def _vlrs(self, layout: Layout) -> list[Record]:
@@ -270,8 +250,8 @@ class LasOutput(CloudWriter):
         if self._written != self._header.n_points:
             raise InvalidInputError(f"{self._written:,} of {self._header.n_points:,} points were written")
         try:
-            if self._disk is not None:
-                self._disk.done()
+            if self._direct is not None:
+                self._direct.finish()
             if self._sink is not None:
                 self._sink.done()
             header = bytearray(self._new_header)
@@ -285,9 +265,8 @@ class LasOutput(CloudWriter):
 
     def discard(self) -> None:
         try:
-            if self._disk is not None:
-                with contextlib.suppress(Exception):
-                    self._disk.done()
+            if self._direct is not None:
+                self._direct.abandon()
         finally:  # also when the wait is interrupted
             self._out.discard()
 

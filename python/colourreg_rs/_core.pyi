@@ -46,8 +46,9 @@ class View:
         """From a camera model's name and parameters (in the order of ``model.PARAMETER_NAMES``) and
         ``x_cam = rotation @ X + translation``. Raises InvalidInputError."""
 
-    def check_focal(self) -> None:
-        """Raises InvalidInputError for a focal length below 0.05 or above 10,000 times the longer side."""
+    def check_plausible(self) -> None:
+        """Raises InvalidInputError for a focal length below 0.05 or above 10,000 times the longer side, a principal
+        point more than 1,000 times that away, and a distortion that leaves a field of less than a hundredth of it."""
 
     @classmethod
     def dlt(cls, P: FloatArray, width: int, height: int, distortion: FloatArray) -> View:

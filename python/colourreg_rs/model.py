@@ -81,9 +81,9 @@ class Camera:
     def _canonical(self) -> _core.View:
         return _core.View.canonical(self.model, self.width, self.height, self.vector, np.eye(3), np.zeros(3))
 
-    def check_focal(self) -> None:
-        """For cameras that people wrote: raises InvalidInputError for a focal length that none has, as one in mm."""
-        self._canonical().check_focal()
+    def check_plausible(self) -> None:
+        """For cameras that people wrote: raises InvalidInputError for what none has, as a focal length in mm."""
+        self._canonical().check_plausible()
 
     @property
     def vector(self) -> FloatArray:

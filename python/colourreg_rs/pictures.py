@@ -18,24 +18,29 @@ def as_8_bit(image: npt.NDArray[Any]) -> Image:
     return np.ascontiguousarray(image if image.dtype == np.uint8 else (image >> 8).astype(np.uint8))
 
 
-def overlay(photo: npt.NDArray[Any], view: View, xyz: FloatArray, *, points: int = 60_000) -> Image:
-    """The photo, dimmed, with an even choice of the cloud's points over it, coloured by depth (near red, far blue)."""
+def overlay(photo: npt.NDArray[Any], view: View, xyz: FloatArray, *, points: int = 25_000) -> Image:
+    """The photo in grey with points that it sees over it, evenly spread, coloured by depth (near red, far blue)."""
     from matplotlib import colormaps
 
-    picture = (as_8_bit(photo) * 0.6).astype(np.uint8)
-    chosen = np.ascontiguousarray(xyz[:: max(1, len(xyz) // points)])
-    xy, depth = _core.project(view.core, chosen)
+    # Grey and not too light, so that all hues of the points stand out from it.
+    grey = 0.55 * (as_8_bit(photo)[:, :, :3] @ np.array([0.299, 0.587, 0.114]))
+    picture = np.repeat(grey.astype(np.uint8)[:, :, None], 3, axis=2)
     height, width = picture.shape[:2]
-    with np.errstate(invalid="ignore"):
-        inside = (xy >= -0.5).all(1) & (xy < np.array([width, height]) - 0.5).all(1)
-    if not inside.any():
+    buffer = _core.DepthBuffer(view.core)
+    buffer.add(np.ascontiguousarray(xyz))
+    seen = np.ascontiguousarray(xyz[buffer.finish().visible(np.ascontiguousarray(xyz))])
+    if not len(seen):
         return picture
-    xy, depth = xy[inside], depth[inside]
+    xy, depth = _core.project(view.core, seen)
+    cell = np.sqrt(width * height / points)
+    column, row = np.floor((xy + 0.5) / cell).astype(np.int64).T
+    _, chosen = np.unique(row * (width + 1) + column, return_index=True)
+    xy, depth = xy[chosen], depth[chosen]
     near, far = np.log(np.percentile(depth, [2, 98]))
     shade = 1 - np.clip((np.log(depth) - near) / max(far - near, 1e-6), 0, 1)
-    colours = (colormaps["turbo"](shade)[:, :3] * 255).astype(np.uint8)
-    size = max(1, round(max(width, height) / 1500))
-    _splat(picture, xy, depth, colours, size)
+    # The map's own ends are dark.
+    colours = (colormaps["turbo"](0.1 + 0.8 * shade)[:, :3] * 255).astype(np.uint8)
+    _splat(picture, xy, depth, colours, max(1, round(max(width, height) / 700)))
     return picture
 
 

@@ -18,6 +18,13 @@ pub const MAX_PARAMS: usize = 12;
 /// telescope of 100 m the largest.
 const FOCAL: (f64, f64) = (0.05, 1e4);
 
+/// How far from the picture its principal point may be, in units of the longer side: far, as pictures may be small pieces
+/// of larger ones.
+const PRINCIPAL_POINT: f64 = 1e3;
+
+/// A lens whose field is smaller than this share of the longer side shows nothing.
+const FIELD: f64 = 0.01;
+
 /// The camera models, with parameters in OpenCV's meaning.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Model {
@@ -144,10 +151,10 @@ impl Camera {
         Ok(Self { model, width, height, fx: p(0), fy: p(1), cx: p(2), cy: p(3), skew: 0.0, lens })
     }
 
-    /// Refuses focal lengths that no camera has. Not a part of [`Camera::new`]: an iteration may pass through such values,
-    /// a DLT matrix is of use without its parts having a meaning, and what an estimate comes to has tests of its own. It is
-    /// for what people write.
-    pub fn check_focal(&self) -> Result<()> {
+    /// Refuses focal lengths, principal points and distortions that no camera has. Not a part of [`Camera::new`]: an
+    /// iteration may pass through such values, a DLT matrix is of use without its parts having a meaning, and what an
+    /// estimate comes to has tests of its own. It is for what people write.
+    pub fn check_plausible(&self) -> Result<()> {
         let (size, names) = (f64::from(self.width.max(self.height)), self.model.parameters());
         for (name, value) in names.iter().zip([self.fx, self.fy]) {
             if !(FOCAL.0 * size..=FOCAL.1 * size).contains(&value) {
@@ -161,6 +168,29 @@ impl Camera {
                     (FOCAL.1 * size).round()
                 )));
             }
+        }
+        for (axis, value) in ["cx", "cy"].iter().zip([self.cx, self.cy]) {
+            if value.abs() > PRINCIPAL_POINT * size {
+                return Err(Error::invalid(format!(
+                    "{} camera: {axis} = {value:?} is no place of a principal point, more than {PRINCIPAL_POINT} pictures \
+                     of {} × {} pixels away",
+                    self.model.name(),
+                    self.width,
+                    self.height
+                )));
+            }
+        }
+        let field = match &self.lens {
+            Lens::Polynomial(lens) => self.fx.min(self.fy) * lens.max_r2.sqrt(),
+            Lens::Fisheye(lens) => self.fx.min(self.fy) * lens.max_theta,
+            Lens::Equirectangular => return Ok(()),
+        };
+        if field < FIELD * size {
+            return Err(Error::invalid(format!(
+                "{} camera: its distortion turns the picture back {field:.2} pixels from the principal point, so that nothing \
+                 is seen: the terms are those of coordinates divided by the focal length, not of pixels or mm",
+                self.model.name()
+            )));
         }
         Ok(())
     }

@@ -33,8 +33,8 @@ impl PyView {
         Ok(Self(geometry::View::new(camera, pose)))
     }
 
-    fn check_focal(&self) -> PyResult<()> {
-        Ok(self.0.camera.check_focal()?)
+    fn check_plausible(&self) -> PyResult<()> {
+        Ok(self.0.camera.check_plausible()?)
     }
 
     #[classmethod]

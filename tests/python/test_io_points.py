@@ -64,7 +64,7 @@ def test_names_of_the_windows_code_page(tmp_path):
 
 def test_columns_in_any_order_with_roles_and_sigmas(tmp_path):
     path = tmp_path / "p.csv"
-    path.write_text("role,x,y,name,Z,Y,X,sx,sy,sX,sY,sZ\nCheck,1,2,a,3,4,5,.1,.2,.3,.4,.5\n,1,2,b,3,4,5,,,,,\n")
+    path.write_text("role,x,y,name,Z,Y,X,sx,sy,sX,sY,sZ\nCheck,1,2,a,3,4,5,.1,.2,.3,.4,.5\n,1,2,b,3,4,6,,,,,\n")
     a, b = read_points(path)
     assert a.role == "check" and b.role == "control"
     assert a.xyz.tolist() == [5, 4, 3] and a.sigma_xy.tolist() == [0.1, 0.2] and a.sigma_xyz.tolist() == [0.3, 0.4, 0.5]
@@ -94,6 +94,7 @@ H = "name,X,Y,Z,x,y\n"
         (H + 'T1,"1,5",2,3,4,5\n', ["line 2, column X", "'1,5'", "decimal comma"]),
         (H + "T1,1,2,3,4,5\nT1,1,2,3,4,5\n", ["lines 2 and 3", "'T1'"]),
         (H + "\n\nT1,1,2,3,4,5\n\nT1,1,2,3,4,5\n", ["lines 4 and 6"]),
+        (H + "T1,1,2,3,4,5\nT2,1,2,3,4,6\nT3,1,2,3.0,4,5\n", ["lines 2 and 4", "'T1' and 'T3' are one pick"]),
         (H + ",1,2,3,4,5\n", ["line 2", "without a name"]),
         (H + "T1,,2,3,4,5\n", ["line 2, column X", "is empty"]),
         (H + "T1,nan,2,3,4,5\n", ["line 2, column X", "no finite number"]),
@@ -150,7 +151,7 @@ point = st.builds(
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True)
-@given(st.lists(point, min_size=1, max_size=6, unique_by=lambda p: p.name))
+@given(st.lists(point, min_size=1, max_size=6, unique_by=(lambda p: p.name, lambda p: (*p.xyz, *p.xy))))
 def test_what_is_written_is_read_to_the_last_bit(tmp_path, points):
     path = tmp_path / "p.csv"
     write_points(path, points)

@@ -157,6 +157,8 @@ V = ("views", 0)
         (changed(*V, "pose", value=None), ["views[0]: needs camera and pose, or dlt"]),
         (changed(*V, "camera", "params", "fx", value="3100"), ["views[0].camera.params.fx", "number", '"3100"']),
         (changed(*V, "camera", "params", "fx", value=-1.0), ["views[0]", "-1"]),
+        (changed(*V, "camera", "params", "cx", value=1e300), ["views[0]", "cx = 1e300", "4000 × 3000"]),
+        (changed(*V, "camera", "params", "k1", value=-1e300), ["views[0]", "0.00 pixels from the principal point"]),
         (changed(*V, "camera", "params", value={"fx": 1, "fy": 1, "cx": 0}), ["views[0]", "lacks cy"]),
         (changed(*V, "camera", "params", "k9", value=1), ["views[0]", "k9"]),
         (changed(*V, "camera", "width", value=0), ["views[0].camera.width", "greater than 0", "not 0"]),

@@ -154,7 +154,7 @@ def _validated(path: Path, part: type[Part], data: Any) -> Part:
 
 def _camera(part: CameraPart) -> Camera:
     camera = Camera(part.model, part.width, part.height, part.params)
-    camera.check_focal()
+    camera.check_plausible()
     return camera
 
 

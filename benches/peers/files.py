@@ -63,8 +63,10 @@ def make_input(folder: Path, points: int, suffix: str) -> None:
 
 def colourreg(folder: str, suffix: str) -> float:
     from colourreg_rs.colourise import colourise_file, load_views
+    from colourreg_rs.io.clouds import open_cloud
 
     load_views([Path(folder, "registration.json")])
+    open_cloud(Path(folder, f"scan{suffix}")).close()
     out = Path(folder, f"out{suffix}")
     out.unlink(missing_ok=True)
     began = time.perf_counter()

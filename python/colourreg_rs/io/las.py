@@ -29,6 +29,7 @@ from .las_header import (
     read_header,
     take,
 )
+from .pool import Pool
 
 #: Points that are looked at to see whether the header's bounds can be believed.
 _LOOK = 50_000
@@ -146,18 +147,18 @@ class LasReader(CloudReader):
             raise FileError(self.path, f"cannot be read: {reason(error)}", None) from error
 
     def _chunks(self, file: IO[bytes], size: int, positions_only: bool) -> Iterator[LasChunk]:
-        start = 0
+        start, pool = 0, Pool()
         if self.laz is None:
             length = self.header.record_length
             size = min(size, PIECE)
+            file.seek(self.header.point_offset)
             while start < self.n_points:
-                count = min(size, self.n_points - start)
-                file.seek(self.header.point_offset + start * length)
-                records = np.fromfile(file, np.uint8, count * length)
-                if len(records) < count * length:
+                records = pool.array((min(size, self.n_points - start), length), np.uint8)
+                if file.readinto(records.data) < records.nbytes:  # type: ignore[attr-defined]
                     raise FileError(self.path, f"ends after {start:,} points", "did somebody change it meanwhile?")
-                yield LasChunk(self, start, records.reshape(count, length), None)
-                start += count
+                yield LasChunk(self, start, records, None, pool=pool)
+                start += len(records)
+                del records  # a chunk that nobody keeps gives its memory to the next
         elif self.laz.largest <= size and self.laz.table:
             layered = self.laz.scheme.layered
             # Enough blocks to keep all processors busy until the last of them.
@@ -165,14 +166,14 @@ class LasReader(CloudReader):
             selection = laz.POSITIONS if positions_only else laz.POSITIONS_AND_COLOUR
             for block in self.laz.blocks(file, size):
                 if layered:
-                    yield LasChunk(self, start, self.laz.decode(block, selection), block, selection)
+                    yield LasChunk(self, start, self.laz.decode(block, selection), block, selection, pool=pool)
                 else:
-                    yield LasChunk(self, start, self.laz.decode(block), block)
+                    yield LasChunk(self, start, self.laz.decode(block), block, pool=pool)
                 start += block.n_points
         else:
             selection = laz.POSITIONS if positions_only else laz.EVERYTHING
             for records in self.laz.stream(file, size, selection):
-                yield LasChunk(self, start, records, None)
+                yield LasChunk(self, start, records, None, pool=pool)
                 start += len(records)
 
     def close(self) -> None:
@@ -213,13 +214,15 @@ class LasChunk(CloudChunk):
         records: npt.NDArray[np.uint8],
         block: laz.Block | None,
         selection: int = laz.EVERYTHING,
+        *,
+        pool: Pool,
     ) -> None:
         header = reader.header
         self.start = start
         self.record = (records, block)
         self.positions = records
         self.block = block
-        self.xyz = np.empty((len(records), 3))  # of numpy's own, as it asks the system for large pages
+        self.xyz = pool.array((len(records), 3), np.float64)
         _core.scaled_xyz(records, np.array(header.scale), np.array(header.offset), self.xyz)
         self._reader = reader
         self._complete = selection == laz.EVERYTHING

@@ -24,6 +24,11 @@ def reason(error: OSError) -> str:
     return (error.strerror or str(error) or type(error).__name__).lower()
 
 
+def not_written(path: Path, error: OSError) -> FileError:
+    """What to raise where the operating system refuses to write."""
+    return FileError(path, f"cannot be written: {reason(error)}", _remedy(error))
+
+
 class AtomicFile:
     """A file under construction: ``file`` is open for writing and reading until the ``with`` block ends.
 
@@ -43,7 +48,7 @@ class AtomicFile:
             self._temporary = self._target.with_name(name)
             self.file: IO[bytes] = self._temporary.open("x+b", buffering=1 << 20)
         except OSError as error:
-            raise FileError(self.path, f"cannot be written: {reason(error)}", _remedy(error)) from error
+            raise not_written(self.path, error) from error
 
     def __enter__(self) -> AtomicFile:
         return self
@@ -56,7 +61,7 @@ class AtomicFile:
             return
         self.discard()
         if isinstance(error, OSError):
-            raise FileError(self.path, f"cannot be written: {reason(error)}", _remedy(error)) from error
+            raise not_written(self.path, error) from error
 
     def commit(self) -> None:
         """Forces the file to the disk and gives it its name."""
@@ -70,7 +75,7 @@ class AtomicFile:
             self._temporary.replace(self._target)
         except OSError as error:
             self.discard()
-            raise FileError(self.path, f"cannot be written: {reason(error)}", _remedy(error)) from error
+            raise not_written(self.path, error) from error
         except BaseException:
             self.discard()
             raise

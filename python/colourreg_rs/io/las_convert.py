@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from .. import __version__
 from ..errors import FileError, InvalidInputError
+from .atomic import not_written
 from .clouds import AnyArray, CloudChunk, CloudReader, Extent, MemoryReader
 from .las_header import EXTRA_TYPES, RECORD_SIZE, ExtraBytes, LasHeader, Record, attributes, describe_extra
 from .las_write import LasOutput
@@ -103,7 +104,7 @@ class LasConverter(LasOutput):
         try:
             self.write_records(lambda: self._records(chunk), len(chunk), chunk.start, rgb, source, sigma)
         except OSError as error:
-            raise FileError(self.path, f"cannot be written: {error.strerror or error}", None) from error
+            raise not_written(self.path, error) from error
 
     def _records(self, chunk: CloudChunk) -> npt.NDArray[np.uint8]:
         fields: list[tuple[str, str, int]] = [("xyz", "(3,)<i4", 0), ("intensity", "<u2", 12), ("returns", "u1", 14)]

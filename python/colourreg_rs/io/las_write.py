@@ -14,7 +14,7 @@ import numpy.typing as npt
 from .. import _core
 from ..errors import FileError, InvalidInputError
 from . import laz
-from .atomic import AtomicFile
+from .atomic import AtomicFile, not_written
 from .clouds import (
     SIGMA_NAME,
     SIGMA_TEXT,
@@ -260,7 +260,7 @@ class LasOutput(CloudWriter):
             self._file.seek(0)
             self._file.write(bytes(header))
         except OSError as error:
-            raise FileError(self.path, f"cannot be written: {error.strerror or error}", None) from error
+            raise not_written(self.path, error) from error
         self._out.commit()
 
     def discard(self) -> None:
@@ -293,7 +293,7 @@ class LasWriter(LasOutput):
         try:
             self.write_records(lambda: chunk.records, len(chunk), chunk.start, rgb, source, sigma, chunk)
         except OSError as error:
-            raise FileError(self.path, f"cannot be written: {error.strerror or error}", None) from error
+            raise not_written(self.path, error) from error
 
     def write_tail(self) -> dict[int, bytes]:
         like, header = self._like, self._header

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from .. import __version__, _core
 from ..errors import FileError, InvalidInputError
-from .atomic import AtomicFile
+from .atomic import AtomicFile, not_written
 from .clouds import (
     SIGMA_NAME,
     SIGMA_TYPE,
@@ -74,7 +74,7 @@ class PlyOutput(CloudWriter):
                 self.begin(given)
             self.put(chunk, rgb, source, sigma)
         except OSError as error:
-            raise FileError(self.path, f"cannot be written: {error.strerror or error}", None) from error
+            raise not_written(self.path, error) from error
         self._written += n
 
     def begin(self, given: tuple[bool, bool, bool]) -> None:
@@ -94,7 +94,7 @@ class PlyOutput(CloudWriter):
         try:
             self.finish()
         except OSError as error:
-            raise FileError(self.path, f"cannot be written: {error.strerror or error}", None) from error
+            raise not_written(self.path, error) from error
         self._out.commit()
 
     def discard(self) -> None:

@@ -345,10 +345,10 @@ def information_distance(
     points."""
 
 class RegressionPhoto:
-    """A photo's channels (C, H, W), 1 to 4 of them, blurred by ``sigma`` px, prepared for :func:`regress_patches`.
-    Immutable."""
+    """A photo's channels (C, H, W), 1 to 4 of them, prepared for :func:`regress_patches` as cubic splines through their
+    samples. Immutable."""
 
-    def __init__(self, channels: npt.NDArray[np.float32], *, sigma: float = 0.0) -> None: ...
+    def __init__(self, channels: npt.NDArray[np.float32]) -> None: ...
 
 def regress_patches(
     photo: RegressionPhoto,

@@ -14,7 +14,7 @@
 use rayon::prelude::*;
 
 use super::plane::Plane;
-use super::spline::spline;
+use super::spline::{interpolating, spline};
 use crate::error::{Error, Result};
 
 /// Most channels of a photo.
@@ -23,7 +23,7 @@ const CHANNELS: usize = 4;
 /// The channels, and a polynomial of second order in x and y without its constant.
 const REGRESSORS: usize = CHANNELS + 5;
 
-/// A photo's channels, blurred and ready to be read between pixels.
+/// A photo's channels as spline coefficients, ready to be read between pixels.
 #[derive(Debug, Clone)]
 pub struct RegressionPhoto {
     planes: Vec<Plane>,
@@ -66,19 +66,17 @@ pub struct Patch {
 }
 
 impl RegressionPhoto {
-    /// From planes of equal size, blurred by `sigma` px before they are read.
-    pub fn new(planes: Vec<Plane>, sigma: f32) -> Result<Self> {
+    /// From planes of equal size.
+    pub fn new(planes: &[Plane]) -> Result<Self> {
         if planes.is_empty() || planes.len() > CHANNELS {
             return Err(Error::invalid(format!("a photo has 1 to {CHANNELS} channels, not {}", planes.len())));
         }
-        if !(0.0..=100.0).contains(&sigma) {
-            return Err(Error::invalid(format!("a blur of {sigma} px; it is 0 to 100")));
-        }
-        Ok(Self { planes: planes.iter().map(|p| p.blurred(sigma)).collect() })
+        Ok(Self { planes: planes.par_iter().map(interpolating).collect() })
     }
 
-    /// Values and derivatives by x and y of all channels; `None` within two pixels of the border. The samples
-    /// themselves serve as coefficients: that blurs a little and never rings.
+    /// Values and derivatives by x and y of all channels; `None` within two pixels of the border. The splines go
+    /// through the samples: read through a blur, an edge says of every column of points that it reaches how far the
+    /// column is from it, and is pushed to the middle between two.
     fn read(&self, x: f64, y: f64) -> Option<[[f64; 3]; CHANNELS]> {
         let first = self.planes.first()?;
         let (fx, fy) = (x.floor(), y.floor());
@@ -398,7 +396,7 @@ mod tests {
                 }
             })
         };
-        RegressionPhoto::new(vec![plane(1.0), plane(2.0), plane(3.0)], 0.0).unwrap()
+        RegressionPhoto::new(&[plane(1.0), plane(2.0), plane(3.0)]).unwrap()
     }
 
     fn scattered(n: usize) -> Vec<[f64; 2]> {
@@ -496,6 +494,6 @@ mod tests {
         assert!(found.iter().all(|p| p.value == 0.0 && p.gradient == [0.0, 0.0]), "{found:?}");
         assert!(regress_patches(&photo, &xy, &design, &values, &[&[600]], &options).is_err());
         assert!(regress_patches(&photo, &xy, &design[1..], &values, &[&all], &options).is_err());
-        assert!(RegressionPhoto::new(vec![], 0.5).is_err());
+        assert!(RegressionPhoto::new(&[]).is_err());
     }
 }

@@ -258,15 +258,14 @@ pub(super) struct PyRegressionPhoto(RegressionPhoto);
 #[pymethods]
 impl PyRegressionPhoto {
     #[new]
-    #[pyo3(signature = (channels, *, sigma=0.0))]
-    fn new(py: Python<'_>, channels: &Bound<'_, PyAny>, sigma: f32) -> PyResult<Self> {
+    fn new(py: Python<'_>, channels: &Bound<'_, PyAny>) -> PyResult<Self> {
         let input = Input::<f32>::new(channels, "channels", &[None, None, None])?;
         let (height, width) = (input.shape()[1], input.shape()[2]);
         let values = input.values()?;
         let made = py.detach(|| {
             let size = (width * height).max(1);
             let planes = values.chunks_exact(size).map(|c| Plane::new(width, height, c.to_vec()));
-            RegressionPhoto::new(planes.collect::<Result<_, _>>()?, sigma)
+            RegressionPhoto::new(&planes.collect::<Result<Vec<_>, _>>()?)
         });
         Ok(Self(made?))
     }

@@ -17,10 +17,12 @@ from colourreg_rs.io.images import write_image
 from colourreg_rs.io.registration import read_registration, write_registration
 from colourreg_rs.matching.afar import agreeing_rotations
 from colourreg_rs.matching.correspondences import Correspondences
-from colourreg_rs.matching.match_covariance import match_covariance
+from colourreg_rs.matching.match_covariance import PATCHES_SYSTEMATIC, match_covariance, patch_covariance
 from colourreg_rs.matching.parameters import design
+from colourreg_rs.matching.pointwise import STRIDE, Patches, weights
 from colourreg_rs.matching.register_sci import SciOptions, register_sci
 from colourreg_rs.model import Registration
+from colourreg_rs.register.sci import limits
 from colourreg_rs.simulate import simulate
 
 
@@ -106,6 +108,48 @@ def test_the_covariance_meets_the_scatter_of_correlated_matches(rng):
         independent.append(error @ (rows.T @ rows / sigma**2) @ error < 12.59)
     assert np.mean(inside) > 0.8
     assert np.mean(independent) < 0.3
+
+
+def test_the_covariance_meets_the_scatter_of_patches_along_scan_lines(rng):
+    """Upright edges that are off from end to end, level ones likewise: stated without the factors that stand for other
+    errors, the covariance holds the scatter, where one that takes patches as independent is far too small."""
+    camera = Camera("PINHOLE", 1200, 800, {"fx": 1300.0, "fy": 1300.0, "cx": 599.5, "cy": 399.5})
+    view = View("v", None, camera, Pose(np.eye(3), np.zeros(3)))
+    names = ("rx", "ry", "rz", "cx_world", "cy_world", "cz_world")
+    columns, rows = np.meshgrid(np.arange(15.0, 1200, 30), np.arange(15.0, 800, 30))
+    places = np.column_stack([columns.ravel(), rows.ravel()])
+    depth = rng.uniform(5, 20, len(places))
+    xyz = np.column_stack([(places - [599.5, 399.5]) / 1300 * depth[:, None], depth])
+    slopes = design(view, names, xyz)
+    information = np.einsum("nki,nkj->nij", slopes, slopes)
+    total, sigma = information.sum(0), 0.5
+    stated, independent = [], []
+    for _ in range(200):
+        off = np.column_stack([rng.normal(0, sigma, 40)[(columns.ravel() // 30).astype(int)],
+                               rng.normal(0, sigma, 27)[(rows.ravel() // 30).astype(int)]])  # fmt: skip
+        gradient = np.einsum("nki,nk->ni", slopes, off)
+        error = np.linalg.solve(total, gradient.sum(0))
+        left = gradient - information @ error
+        patches = Patches(names, places, left, information, *np.ones((3, len(places))))
+        covariance = patch_covariance(view, patches, xyz, 0.0).matrix / (PATCHES_SYSTEMATIC * STRIDE**2)
+        stated.append(error @ np.linalg.solve(covariance, error))
+        independent.append(error @ (total / sigma**2) @ error)
+    assert 4.0 < np.mean(stated) < 12.0, np.mean(stated)
+    assert np.mean(independent) > 60.0
+
+
+def test_no_patch_outvotes_the_others():
+    mean = np.eye(6)[None] * np.ones((50, 1, 1))
+    assert np.allclose(weights(mean), 0.5)
+    one = np.concatenate([mean, 1e4 * np.eye(6)[None]])
+    assert (one[:, 0, 0] * weights(one)).max() < one[:, 0, 0].mean()
+    assert np.isfinite(weights(np.zeros((3, 6, 6)))).all()
+
+
+def test_a_coarse_scan_is_named_as_what_limits_a_registration():
+    assert limits(0.3, 3.6) == ()
+    (line,) = limits(0.62, 6.8)
+    assert "0.6 px" in line and "6.8 px apart" in line
 
 
 @pytest.mark.slow

@@ -10,19 +10,22 @@ everywhere. Taken as independent, a thousand matches promise a tenth of the erro
 - and a factor for what errs alike wherever the same is built.
 
 The patches of the last step (:mod:`.pointwise`) are treated like matches: their gradients sum up in ``G``, their
-information in ``H``.
+information in ``H``. But what errs together there is another thing: an upright edge lies somewhere between two columns
+of the scan, from end to end, and a level one between two rows. So a patch's neighbours are those above and below it and
+those beside it, over the whole photo.
 
 How well this holds is measured by ``python -m colourreg_rs.experiments.sci_accuracy``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from .. import _core
 from ..model import Covariance, FloatArray, View
+from ..sci import Float32Array
 from .parameters import design
 from .pointwise import STRIDE, Patches
 
@@ -36,17 +39,19 @@ COMMON = 0.15
 #: above were set on façades and rooms with seeds 0 to 9.
 SYSTEMATIC = 2.5
 
-#: The same distance for patches of points: of 0.02 to 0.18 the one that makes the true errors on façades and rooms with
-#: seeds 100 to 119 most likely.
-PATCHES_LENGTH = 0.08
+#: The distance across lines of points over which patches err together; along them they do from end to end. Of 0.015 to
+#: 0.03, and of a distance in all directions from 0.02 to 0.18, nearly the one that makes the true errors on façades and
+#: rooms with seeds 100 to 119 most likely.
+PATCHES_LENGTH = 0.02
 
 #: The error common to all patches, px of the level, one sigma in x and in y. In those scenes there is none to be seen;
 #: colours that a camera has put onto a real cloud lay 0.1 px beside its next picture.
 PATCHES_COMMON = 0.06
 
-#: What is left unexplained, as a factor of the variances, found with the length: beside that of the stride, since the
-#: patches' information is that of Gauss-Newton, larger than the likelihood's curvature by :data:`.pointwise.STRIDE`.
-PATCHES_SYSTEMATIC = 1.6
+#: What is left unexplained, as a factor of the variances: the one with which 95 % of those scenes' regions hold the
+#: truth. It stands beside that of the stride, since the patches' information is that of Gauss-Newton, larger than the
+#: likelihood's curvature by :data:`.pointwise.STRIDE`.
+PATCHES_SYSTEMATIC = 3.3
 
 
 def match_covariance(
@@ -77,7 +82,7 @@ def match_covariance(
     # What a shift of all matches by one px in x, in y, adds to the gradient.
     shifted = np.stack([np.einsum("nki,nk->i", rows, factors[:, :, axis]) for axis in range(2)])
     common = COMMON * pixel
-    return _sandwich(view, names, xy, information, gradients, shifted * common, CORRELATION_LENGTH, SYSTEMATIC)
+    return _sandwich(view, names, xy, information, gradients, shifted * common, _near, CORRELATION_LENGTH, SYSTEMATIC)
 
 
 def patch_covariance(view: View, patches: Patches, seen: FloatArray, pixel: float) -> Covariance | None:
@@ -100,8 +105,20 @@ def patch_covariance(view: View, patches: Patches, seen: FloatArray, pixel: floa
     factor = PATCHES_SYSTEMATIC * STRIDE**2
     common = shifts @ information * (PATCHES_COMMON * pixel / np.sqrt(factor))
     return _sandwich(
-        view, patches.names, patches.places, patches.information, patches.gradient, common, PATCHES_LENGTH, factor
-    )
+        view, patches.names, patches.places, patches.information, patches.gradient, common, _in_line, PATCHES_LENGTH,
+        factor,
+    )  # fmt: skip
+
+
+def _near(places: Float32Array) -> Float32Array:
+    """How much matches at ``places`` (K, 2), in lengths, err together: a Gaussian of their distance."""
+    square = (places**2).sum(1)
+    return np.asarray(np.exp(-0.5 * np.maximum(square[:, None] + square[None] - 2 * places @ places.T, 0)))
+
+
+def _in_line(places: Float32Array) -> Float32Array:
+    """The same of patches, half of it for lying above each other and half for lying beside each other."""
+    return np.asarray(0.5 * (_near(places[:, :1]) + _near(places[:, 1:])))
 
 
 def _sandwich(
@@ -111,11 +128,12 @@ def _sandwich(
     information: FloatArray,
     gradients: FloatArray,
     common: FloatArray,
+    kernel: Callable[[Float32Array], Float32Array],
     length: float,
     systematic: float,
 ) -> Covariance | None:
-    """``H⁻¹ G H⁻¹`` of information (K, U, U) and gradients (K, U) at places (K, 2), that err together over
-    ``length``, with errors common to all, whose gradients are ``common`` (C, U)."""
+    """``H⁻¹ G H⁻¹`` of information (K, U, U) and gradients (K, U) at places (K, 2), that err together as
+    ``kernel`` says over ``length``, with errors common to all, whose gradients are ``common`` (C, U)."""
     # Columns of length 1 for the numbers' sake.
     size = np.sqrt(np.diagonal(information, axis1=1, axis2=2).sum(0))
     if not (size > 0).all():
@@ -128,14 +146,12 @@ def _sandwich(
         return None
     long_side = max(view.core.width, view.core.height)
     # Dense, but of float32 and of at most some thousand matches.
-    place = (places / (length * long_side)).astype(np.float32)
-    square = (place**2).sum(1)
-    kernel = np.exp(-0.5 * np.maximum(square[:, None] + square[None] - 2 * place @ place.T, 0))
-    filling = gradients.T @ (kernel @ gradients.astype(np.float32)).astype(np.float64)
+    together = kernel((places / (length * long_side)).astype(np.float32))
+    filling = gradients.T @ (together @ gradients.astype(np.float32)).astype(np.float64)
     # Independent places: (Σ w)² / Σ w w' K, each weighing what it contributes; each parameter uses one half of a
     # match's two coordinates.
     weight = np.trace(scaled, axis1=1, axis2=2)
-    independent = float(weight.sum() ** 2 / (weight @ (kernel @ weight.astype(np.float32))))
+    independent = float(weight.sum() ** 2 / (weight @ (together @ weight.astype(np.float32))))
     correction = independent / max(independent - 0.5 * len(names), 1.0)
     inverse = np.linalg.inv(curvature)
     total = correction * inverse @ filling @ inverse

@@ -23,6 +23,14 @@ from .parameters import design
 #: points to tell them apart.
 CELL, CELL_SPACINGS = 24, 9.0
 
+#: The photo is read with so many pixels per spacing of the points, if it has them: read through the blur of a coarser
+#: one, edges that lie between two columns of points are pushed to the middle, all along and whatever else is known.
+READ = 6.0
+
+#: A patch says at most about so much as this many mean ones: a long edge between two columns of points explains every
+#: intensity beside it and is still uncertain by the gap.
+CAP = 1.0
+
 #: Patches of fewer points have no say.
 LEAST_POINTS = 40
 
@@ -50,7 +58,8 @@ class Patches:
     """What the patches say of a view's ``names``; rows go together.
 
     ``places`` (K, 2): their middles, px of the photo; ``gradient`` (K, U) and ``information`` (K, U, U) of the
-    log-likelihoods ``value`` (K,); ``explained`` (K,): the share of the intensities' variance; ``points`` (K,).
+    log-likelihoods ``value`` (K,), weighed against each other; ``explained`` (K,): the share of the intensities'
+    variance; ``points`` (K,).
     """
 
     names: tuple[str, ...]
@@ -145,10 +154,22 @@ class Look:
             np.ascontiguousarray((projected + 0.5) * self.photo.scale(view) - 0.5),
             self.slopes, self.values, self.members, self.ends, least_points=LEAST_POINTS, order=ORDER,
         )  # fmt: skip
+        weight = weights(found["information"])
         return Patches(
             self.names, self.places,
-            found["gradient"], found["information"], found["value"], found["explained"], found["points"],
+            found["gradient"] * weight[:, None], found["information"] * weight[:, None, None],
+            found["value"], found["explained"], found["points"],
         )  # fmt: skip
+
+
+def weights(information: FloatArray) -> FloatArray:
+    """Of patches with ``information`` (K, U, U). Each is uncertain by its noise, and by something that is alike in all:
+    what it says grows up to :data:`CAP` times the mean and no farther."""
+    each = np.diagonal(information, axis1=1, axis2=2)
+    total = each.sum(0)
+    share = (each / np.where(total > 0, total, 1.0)).sum(1)
+    mean = share.sum() / max(int((share > 0).sum()), 1)
+    return np.asarray(1.0 / (1.0 + share / (CAP * mean))) if mean > 0 else np.ones(len(share))
 
 
 def _laid_out(

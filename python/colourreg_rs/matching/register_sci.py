@@ -34,7 +34,7 @@ from .correspondences import (
 )
 from .match_covariance import match_covariance, patch_covariance
 from .parameters import design, stepped, value_of
-from .pointwise import LOOKS, STEPS, STRIDE, Look, Patches, PointwisePhoto
+from .pointwise import LOOKS, READ, STEPS, STRIDE, Look, Patches, PointwisePhoto
 from .surfaces import Linearised, Surfaces, find_surfaces, joined
 
 #: The finest level has this many pixels per spacing of the points: matches err by a share of the level's pixel,
@@ -195,8 +195,8 @@ class _Loop:
         self.supported = supported_scale(self.cloud, self.start)
         if self.supported == 0.0:
             raise _LoopError("no point of the cloud lies in the photo at the start")
-        finest = min(1.0, OVERSAMPLING * self.supported)
-        scales = [finest]
+        self.finest = min(1.0, OVERSAMPLING * self.supported)
+        scales = [self.finest]
         while not self.options.single and scales[0] * self.long_side > 1.5 * COARSEST:
             scales.insert(0, scales[0] / 2)
         return scales
@@ -297,8 +297,8 @@ class _Loop:
 
     def _settled(self, view: View) -> View:
         """The view at which the photo explains most of the points' intensities, from here upwards."""
-        scale = self.turns[-1].scale
-        width, height = self.last.level
+        scale = min(1.0, READ * self.supported)
+        width, height = (max(round(n * scale), 16) for n in (view.core.width, view.core.height))
         photo = PointwisePhoto(self.photo.pixels, width, height)
         for _ in range(LOOKS):
             before, spacing = view, scale / self.supported
@@ -433,7 +433,7 @@ class _Loop:
         statistics = {
             "matches": len(found), "used": used, "turns": len(self.turns), "confirmed": confirmed,
             "confirmed_by_chance": by_chance, "predicted_error_px": predicted, "last_move_px": last.moved,
-            "improvement": improvement[0],
+            "improvement": improvement[0], "point_spacing_px": 1.0 / self.supported,
         }  # fmt: skip
         trusted = not reasons
         result = replace(view, method="sci", statistics=statistics) if trusted else self.start
@@ -456,8 +456,8 @@ class _Loop:
         return float(np.sqrt(variances.mean())) if len(rows) else float("nan")
 
     def _one_up(self) -> float:
-        """The scale of the level above the last, or the last where it is the coarsest."""
-        scale = self.turns[-1].scale
+        """The scale of the level above the finest, or the finest where it is the coarsest."""
+        scale = self.finest
         return scale * (0.5 if scale * self.long_side > COARSEST else 1.0)
 
     def _confirmed(self, view: View) -> tuple[float, float, float, int, FloatArray]:

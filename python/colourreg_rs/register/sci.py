@@ -14,6 +14,9 @@ from .options import RegisterOptions, parse_prior
 from .result import RegisterResult
 from .start import StartingView
 
+#: A predicted error, px per coordinate, above which the result says what limits it.
+WORTH_A_WORD = 0.5
+
 POSE = {"rx", "ry", "rz", "cx_world", "cy_world", "cz_world"}
 
 
@@ -42,6 +45,7 @@ def by_sci(cloud: Path, photo: Path, start: StartingView, options: RegisterOptio
         registration=Registration((found.view,), cloud, points.crs_wkt),
         evaluation=None,
         notes=(f"{start.origin}; free: {', '.join(free)}",),
+        warnings=limits(found.predicted_error, found.statistics["point_spacing_px"]),
         free=free,
         facts={
             "matches_used": found.used,
@@ -51,4 +55,14 @@ def by_sci(cloud: Path, photo: Path, start: StartingView, options: RegisterOptio
             "confirmed_by_chance": round(found.by_chance, 3),
             "predicted_error_px": round(found.predicted_error, 3),
         },
+    )
+
+
+def limits(predicted: float, spacing: float) -> tuple[str, ...]:
+    """What is to be said of a view with a predicted error, px per coordinate, from points ``spacing`` px apart."""
+    if predicted <= WORTH_A_WORD:
+        return ()
+    return (
+        f"the predicted error over the photo is {predicted:.1f} px per coordinate: points are {spacing:.1f} "
+        "px apart there, and an edge along the scan's columns or rows lies anywhere between two of them",
     )

@@ -39,9 +39,9 @@ COMMON = 0.15
 #: above were set on façades and rooms with seeds 0 to 9.
 SYSTEMATIC = 2.5
 
-#: The distance across lines of points over which patches err together; along them they do from end to end. Of 0.015 to
-#: 0.03, and of a distance in all directions from 0.02 to 0.18, nearly the one that makes the true errors on façades and
-#: rooms with seeds 100 to 119 most likely.
+#: The distance across lines of points over which patches err together; along them they do from end to end. As a patch;
+#: 0.015 to 0.02 makes the true errors on façades and rooms with seeds 100 to 119 more likely than wider ones, and than
+#: any distance in all directions.
 PATCHES_LENGTH = 0.02
 
 #: The error common to all patches, px of the level, one sigma in x and in y. In those scenes there is none to be seen;

@@ -47,7 +47,7 @@ ORDER = 2
 LAYOUTS = 2
 
 #: At most so many steps between two looks at which points the view sees, and at most so many looks.
-STEPS, LOOKS = 10, 4
+STEPS, LOOKS = 10, 8
 
 #: Gauss-Newton falls short, since the photo has texture that the intensity does not share: steps are longer by this.
 STRIDE = 1.4

@@ -105,10 +105,16 @@ impl VisibilityMap {
 
     /// The depth in each pixel of the photo beyond which nothing is visible, row by row; infinite where nothing hides.
     pub fn limit(&self) -> Vec<f32> {
-        let grid = &self.surfaces.grid;
+        let Surfaces { grid, limits, limit, .. } = &self.surfaces;
+        let side = limits.fineness;
+        // A pixel's is that of its part in which the farthest is visible.
+        let of_pixel = |row: usize, column: usize| {
+            let parts = (0..side).flat_map(|j| &limits.photo_row(limit, row * side + j)[column * side..][..side]);
+            1.0 / parts.fold(f32::INFINITY, |least, limit| limit.min(least))
+        };
         (0..grid.height)
             .into_par_iter()
-            .flat_map_iter(|row| grid.photo_row(&self.surfaces.limit, row).iter().map(|limit| 1.0 / limit))
+            .flat_map_iter(|row| (0..grid.width).map(move |column| of_pixel(row, column)))
             .collect()
     }
 
@@ -137,8 +143,8 @@ impl VisibilityMap {
     /// Projects up to [`LANES`] points and finds which of them the photo sees.
     pub(super) fn look(&self, points: &[[f64; 3]], sight: &mut Sight) {
         self.projector.project(points, &mut sight.block);
-        self.surfaces.grid.locate(&sight.block, 0, &mut sight.located);
-        let (limit, stride) = (&self.surfaces.limit, self.surfaces.grid.stride() as u32);
+        self.surfaces.limits.locate(&sight.block, 0, &mut sight.located);
+        let (limit, stride) = (&self.surfaces.limit, self.surfaces.limits.stride() as u32);
         for i in 0..points.len() {
             let (cell, other) = sight.located.ahead_with_row(i, stride);
             crate::render::fetch(limit, cell);
@@ -159,7 +165,7 @@ impl VisibilityMap {
     #[inline(always)]
     fn hidden(&self, cell: usize, inverse: f32, [right, down]: [f32; 2]) -> bool {
         let limit = &self.surfaces.limit;
-        let stride = self.surfaces.grid.stride();
+        let stride = self.surfaces.limits.stride();
         let beside = if right < 0.5 { cell - 1 } else { cell + 1 };
         let above = if down < 0.5 { cell - stride } else { cell + stride };
         let across = above + beside - cell;
@@ -212,7 +218,7 @@ impl VisibilityMap {
     }
 
     /// The cosine of the angle between the ray to a point and the surface's normal, which is given (in the world frame)
-    /// or taken from the depth buffer around the point's cell.
+    /// or taken from the depth buffer around the pixel of the point's cell.
     pub(super) fn cos_incidence(&self, p: &[f64; 3], cell: usize, normal: Option<&[f64; 3]>) -> f64 {
         let ray = nalgebra::Vector3::from(*p) - self.view.pose.centre;
         if let Some(normal) = normal.map(|n| nalgebra::Vector3::from(*n)) {
@@ -222,9 +228,10 @@ impl VisibilityMap {
             }
         }
         let camera = &self.view.camera;
-        let own = f64::from(self.surfaces.samples[cell].inverse_depth());
+        let pixel = self.surfaces.limits.pixel_of(cell);
+        let own = f64::from(self.surfaces.samples[pixel].inverse_depth());
         let stride = self.surfaces.grid.stride();
-        let (gx, gy) = (f64::from(self.slope(cell, 1)), f64::from(self.slope(cell, stride)));
+        let (gx, gy) = (f64::from(self.slope(pixel, 1)), f64::from(self.slope(pixel, stride)));
         let q = self.view.pose.transform(p);
         match camera.depth_kind() {
             Depth::AlongAxis => {
@@ -257,7 +264,7 @@ impl VisibilityMap {
             inside = inside.min(xy[0] + 0.5).min(w - 0.5 - xy[0]);
         }
         let border = (inside / (BORDER * w.max(h))).clamp(0.05, 1.0);
-        let edge = if self.near_an_edge(cell) { 0.2 } else { 1.0 };
+        let edge = if self.near_an_edge(self.surfaces.limits.pixel_of(cell)) { 0.2 } else { 1.0 };
         (density * border * edge) as f32
     }
 

@@ -38,11 +38,8 @@ impl PyDepthBuffer {
         let mut limits = Limits::default();
         limits.max_distance = max_distance.unwrap_or(limits.max_distance);
         limits.max_incidence = max_incidence.unwrap_or(limits.max_incidence);
-        Ok(Self {
-            buffer: RwLock::new(Some(DepthBuffer::new(view.0)?)),
-            footprint: Footprint::new(tolerance, max_gap)?,
-            limits: limits.checked()?,
-        })
+        let (footprint, limits) = (Footprint::new(tolerance, max_gap)?, limits.checked()?);
+        Ok(Self { buffer: RwLock::new(Some(footprint.buffer(view.0)?)), footprint, limits })
     }
 
     fn add(&self, py: Python<'_>, xyz: &Bound<'_, PyAny>) -> PyResult<()> {

@@ -70,7 +70,29 @@ impl Footprint {
         }
         Ok(this)
     }
+
+    /// An empty depth buffer for this. Where a contour runs it tells to about half a cell: a small photo, whose pixels are as
+    /// coarse as the scan, gets cells that are parts of pixels.
+    pub fn buffer(&self, view: View) -> Result<DepthBuffer> {
+        let pixels = f64::from(view.camera.width) * f64::from(view.camera.height);
+        let small = pixels * (PARTS * PARTS) as f64 <= MOST_PARTS as f64;
+        let reached = self.max_gap * PARTS as f32 <= MAX_REACH as f32;
+        let distinct = self.steepest * pixel_angle(&view) <= DISTINCT;
+        DepthBuffer::finer(view, if small && reached && distinct { PARTS } else { 1 })
+    }
 }
+
+/// The most cells that parts of pixels may come to: as many as a usual photo has pixels.
+const MOST_PARTS: usize = 12_000_000;
+/// Parts along the side of a pixel. On simulated scans three gained little over two.
+const PARTS: usize = 2;
+
+/// Of the pixels with a sample the share whose neighbour on the right has one too above which parts of pixels tell nothing new:
+/// points lie as densely as pixels, and a depth camera's on the borders of the parts.
+const DENSE: f64 = 0.8;
+/// The relative step from pixel to pixel up to which a surface may be taken for one, in photos that get parts of pixels: where
+/// it is larger, what shows through gaps is too easily taken for what is before it, and parts leave more gaps.
+const DISTINCT: f32 = 0.1;
 
 /// Sigma of a place, pixels, of which nothing is known but the pixel.
 const ANYWHERE: f32 = 0.29;
@@ -81,10 +103,12 @@ const BAND: usize = 2 * MAX_REACH;
 
 /// The surfaces of a finished depth buffer.
 pub struct Surfaces {
-    /// How the cells lie.
+    /// How the pixels lie.
     pub grid: Grid,
-    /// The nearest point in each cell.
+    /// The nearest point in each pixel.
     pub samples: Vec<Sample>,
+    /// How the limits lie, in pixels or parts of them.
+    pub limits: Grid,
     /// A point in this cell is hidden when its inverse depth is below this; 0 where nothing hides.
     pub limit: Vec<f32>,
     /// Sigma of a depth, in the cloud's unit, as samples scatter about planes.
@@ -105,20 +129,34 @@ impl Surfaces {
 
     fn from_samples(
         view: &View,
-        grid: Grid,
+        mut grid: Grid,
         mut samples: Vec<Sample>,
         place: f32,
         footprint: &Footprint,
     ) -> Result<Self> {
         grid.wrap(&mut samples);
+        let pixels = grid.pixels();
+        let mut in_pixels = if grid == pixels { None } else { Some(grid.in_pixels(&samples)?) };
+        if let Some(dense) = in_pixels.take_if(|samples| neighboured(&pixels, samples) > DENSE) {
+            (grid, samples) = (pixels, dense);
+        }
+        let limits = grid;
+        let pixel_samples = in_pixels.as_deref().unwrap_or(&samples);
         let pixel_angle = pixel_angle(view);
-        let ratios = [footprint.gap_ratio, footprint.row_ratio];
-        let (surroundings, wide_noise) = rayon::join(
-            || Surroundings::new(grid, &samples, footprint.steepest, pixel_angle, ratios),
-            || depth_noise(view, grid, &samples, place),
+        let surroundings = |grid: Grid, samples| {
+            let ratios = [footprint.gap_ratio, footprint.row_ratio];
+            Surroundings::new(grid, samples, footprint.steepest, pixel_angle / grid.fineness as f32, ratios)
+        };
+        // Of pixels: among parts of them neighbours may be too far away to tell the noise.
+        let (noise, wide_noise) = rayon::join(
+            || surroundings(pixels, pixel_samples).depth_noise(),
+            || depth_noise(view, pixels, pixel_samples, place),
         );
         let Footprint { tolerance, inner, .. } = *footprint;
-        let rule = Rule { tolerance, inner, pixel_angle, noise: surroundings.noise(), wide_noise };
+        let max_gap = (footprint.max_gap * grid.fineness as f32).min(MAX_REACH as f32);
+        let pixel_angle = pixel_angle / grid.fineness as f32;
+        let rule = Rule { tolerance, inner, pixel_angle, noise, wide_noise };
+        let surroundings = surroundings(grid, &samples).with_noise(noise);
         let mut limit = fetched(grid.len(), "the surfaces of a depth buffer")?;
         let mut spacing: Vec<u8> = fetched(grid.len(), "the spacing of points")?;
         // Each band fills its own part.
@@ -131,8 +169,8 @@ impl Surfaces {
         drop(parts);
         let mut reach = NEARBY;
         let cells = open.iter().flatten().map(|links| links.cell);
-        let mut pyramid = Pyramid::new(&grid, cells, footprint.max_gap);
-        while reach < footprint.max_gap {
+        let mut pyramid = Pyramid::new(&grid, cells, max_gap);
+        while reach < max_gap {
             open.par_iter_mut().for_each(|band| band.retain(|links| surroundings.may_find_more(links, reach)));
             if open.iter().all(Vec::is_empty) {
                 break;
@@ -143,7 +181,7 @@ impl Surfaces {
             let looked = in_bands(&grid, &mut limit, |band, _, canvas| {
                 let mut list = pending[band].lock().map(|mut list| std::mem::take(&mut *list)).unwrap_or_default();
                 for links in &mut list {
-                    if let Some(patch) = surroundings.farther(links, &pyramid, &spacing, footprint.max_gap) {
+                    if let Some(patch) = surroundings.farther(links, &pyramid, &spacing, max_gap) {
                         canvas.draw(&grid, grid.row_and_column(links.cell), &rule.mark(&patch));
                     }
                 }
@@ -157,7 +195,8 @@ impl Surfaces {
             }
         }
         close(&grid, &mut limit);
-        Ok(Self { grid, samples, limit, noise: wide_noise })
+        let samples = in_pixels.unwrap_or(samples);
+        Ok(Self { grid: pixels, samples, limits, limit, noise: wide_noise })
     }
 }
 
@@ -230,6 +269,18 @@ impl FirstLook<'_> {
         }
         self.open
     }
+}
+
+/// Of the photo's cells with a sample the share whose neighbour on the right has one too.
+fn neighboured(grid: &Grid, samples: &[Sample]) -> f64 {
+    let of_row = |row: usize| {
+        let row = grid.photo_row(samples, row);
+        let pairs = row.windows(2).filter(|pair| pair[0].found() && pair[1].found()).count();
+        [row.iter().filter(|sample| sample.found()).count(), pairs]
+    };
+    let rows = (0..grid.height).into_par_iter().map(of_row);
+    let [found, pairs] = rows.reduce(|| [0; 2], |a, b| [a[0] + b[0], a[1] + b[1]]);
+    pairs as f64 / found.max(1) as f64
 }
 
 /// Closes holes up to three cells wide, which the chance of where points fall leaves in a surface: where limits lie opposite
@@ -348,5 +399,23 @@ pub(crate) fn pixel_angle(view: &View) -> f32 {
     match (camera.unproject(&[x - 0.5, y]), camera.unproject(&[x + 0.5, y])) {
         (Some(a), Some(b)) => (a - b).norm() as f32,
         _ => fallback as f32,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn small_photos_get_parts_of_pixels_unless_gaps_or_pixels_are_too_wide_for_them() {
+        let fineness = |width, height, gap| {
+            let camera = crate::Camera::new(crate::Model::Equirectangular, width, height, &[]).unwrap();
+            let footprint = Footprint::new(None, gap).unwrap();
+            footprint.buffer(View { camera, pose: crate::Pose::identity() }).unwrap().grid().fineness
+        };
+        assert_eq!(fineness(2000, 1000, None), PARTS);
+        assert_eq!(fineness(2000, 1000, Some(40.0)), 1);
+        assert_eq!(fineness(2600, 1300, None), 1);
+        assert_eq!(fineness(600, 300, None), 1);
     }
 }

@@ -173,14 +173,13 @@ impl<'a> Surroundings<'a> {
         let [gap_ratio, row_ratio] = ratios;
         let usual = USUAL * pixel_angle;
         let pruning = Pruning { noise: 0.0, usual, gap_ratio, row_ratio };
-        let mut this = Self { grid, samples, tolerance, steepest, pruning, rings };
-        this.pruning.noise = this.depth_noise();
-        this
+        Self { grid, samples, tolerance, steepest, pruning, rings }
     }
 
-    /// Sigma of a depth, in the cloud's unit.
-    pub fn noise(&self) -> f32 {
-        self.pruning.noise
+    /// With the sigma of a depth, in the cloud's unit.
+    pub fn with_noise(mut self, noise: f32) -> Self {
+        self.pruning.noise = noise;
+        self
     }
 
     #[inline(always)]

@@ -101,6 +101,14 @@ impl Sample {
         Self(if self.found() { self.0 ^ ((1 << PLACE) - 1) } else { 0 })
     }
 
+    /// The same sample in the pixel of which its cell is one of `side` by `side` parts, so many from the left and the top.
+    #[inline(always)]
+    pub(super) fn of_pixel(self, [left, top]: [usize; 2], side: usize) -> Self {
+        let part = |bits: u32, before: usize| ((bits & ((1 << PLACE) - 1)) + ((before as u32) << PLACE)) / side as u32;
+        let place = part(self.0 >> PLACE, left) << PLACE | part(self.0, top);
+        Self(if self.found() { self.0 >> (2 * PLACE) << (2 * PLACE) | place } else { 0 })
+    }
+
     /// Where the point lies against the pixel's centre, right and down, in [−½, ½).
     #[inline(always)]
     pub fn place(self) -> [f32; 2] {

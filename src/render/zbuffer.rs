@@ -14,7 +14,7 @@ use crate::error::{Error, Result};
 #[cfg(target_arch = "x86_64")]
 use crate::geometry::Registers;
 use crate::geometry::{Block, BlockProjector, Frustum, LANES, Model, View};
-use crate::memory::{fresh, zeros};
+use crate::memory::{fetched, fresh, zeros};
 
 /// Points per task of the scheduler.
 const TASK: usize = 16 * LANES;
@@ -29,32 +29,73 @@ const NEAREST: f64 = 1e30;
 /// Where a point is not in the grid.
 const NOWHERE: u32 = u32::MAX;
 
-/// The cells of a buffer: the photo's pixels, a margin around them, and a rim of [`PAD`] empty ones.
+/// The cells of a buffer: the photo's pixels or equal parts of them, a margin around them, and a rim of [`PAD`] empty ones.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Grid {
-    /// The photo's, pixels.
+    /// The photo's, cells.
     pub width: usize,
-    /// The photo's, pixels.
+    /// The photo's, cells.
     pub height: usize,
     /// Cells beyond the photo's border, on all four sides.
     pub margin: usize,
     /// Whether the left and the right border are the same place.
     pub wraps: bool,
+    /// Cells along a pixel's side, a power of two.
+    pub fineness: usize,
 }
 
 impl Grid {
-    /// The grid for a view; refused where the machine could not count its cells.
+    /// The grid for a view, of pixels; refused where the machine could not count its cells.
     pub fn new(view: &View) -> Result<Self> {
+        Self::finer(view, 1)
+    }
+
+    /// The same with so many cells along a pixel's side, a power of two.
+    pub fn finer(view: &View, fineness: usize) -> Result<Self> {
         let (width, height) = (view.camera.width as usize, view.camera.height as usize);
         let wraps = view.camera.model() == Model::Equirectangular;
         let margin = MAX_MARGIN.min(width.max(height) / 16).min(width / 2).min(height);
-        let grid = Self { width, height, margin, wraps };
+        let [wide, high, margin] = [width, height, margin].map(|pixels| pixels * fineness);
+        let grid = Self { width: wide, height: high, margin, wraps, fineness };
         if grid.stride().saturating_mul(grid.rows()) > i32::MAX as usize {
             return Err(Error::invalid(format!(
                 "a photo of {width} × {height} pixels is too large for a depth buffer; make it smaller"
             )));
         }
         Ok(grid)
+    }
+
+    /// The grid of the pixels that these cells are parts of.
+    pub fn pixels(&self) -> Self {
+        let [width, height, margin] = [self.width, self.height, self.margin].map(|cells| cells / self.fineness);
+        Self { width, height, margin, wraps: self.wraps, fineness: 1 }
+    }
+
+    /// The cell among [`Self::pixels`] that a cell, not of the rim, is a part of.
+    pub fn pixel_of(&self, cell: usize) -> usize {
+        if self.fineness == 1 {
+            return cell;
+        }
+        let [row, column] = [cell / self.stride(), cell % self.stride()].map(|k| (k - PAD) / self.fineness + PAD);
+        row * self.pixels().stride() + column
+    }
+
+    /// The nearest sample of each pixel: what a buffer of pixels would hold.
+    pub(super) fn in_pixels(&self, samples: &[Sample]) -> Result<Vec<Sample>> {
+        let (pixels, side, stride) = (self.pixels(), self.fineness, self.stride());
+        let mut out: Vec<Sample> = fetched(pixels.len(), "a depth buffer")?;
+        let used = pixels.first_row()..pixels.rows() - pixels.first_row();
+        out.par_chunks_mut(pixels.stride()).enumerate().filter(|(y, _)| used.contains(y)).for_each(|(y, row)| {
+            for j in 0..side {
+                let first = ((y - PAD) * side + PAD + j) * stride + PAD;
+                for (out, parts) in row[pixels.used_columns()].iter_mut().zip(samples[first..].chunks(side)) {
+                    for (i, part) in parts.iter().enumerate() {
+                        *out = (*out).max(part.of_pixel([i, j], side));
+                    }
+                }
+            }
+        });
+        Ok(out)
     }
 
     /// Cells in a row, with margins and rim.
@@ -129,8 +170,10 @@ impl Grid {
 
     #[inline(always)]
     fn locate_here(&self, block: &Block, margin: usize, cells: &mut Located) {
-        let (low, offset) = (-0.5 - margin as f64, (self.margin + PAD) as f64 + 0.5);
-        let (right, below) = ((self.width + margin) as f64 - 0.5, (self.height + margin) as f64 - 0.5);
+        // Exact, as the fineness is a power of two.
+        let side = self.fineness as f64;
+        let (low, offset) = (-0.5 - margin as f64 / side, (self.margin + PAD) as f64 + 0.5 * side);
+        let (right, below) = ((self.width + margin) as f64 / side - 0.5, (self.height + margin) as f64 / side - 0.5);
         let (last_x, last_y) = (
             (self.width + self.margin + PAD + margin - 1) as f64,
             (self.height + self.margin + PAD + margin - 1) as f64,
@@ -139,6 +182,7 @@ impl Grid {
         for i in 0..LANES {
             let (x, y, depth) = (block.x[i], block.y[i], block.depth[i]);
             let inside = (x >= low) & (x < right) & (y >= low) & (y < below);
+            let (x, y) = (side * x, side * y);
             // The sum may round up to the next cell, which must not lie beyond the last.
             let column = if inside { (x + offset).min(last_x) } else { 0.0 };
             let row = if inside { (y + offset).min(last_y) } else { 0.0 };
@@ -164,7 +208,7 @@ impl Grid {
         self.locate_here(block, margin, cells);
     }
 
-    /// The cells of a block of projected points, as far as they lie in the photo widened by `margin`.
+    /// The cells of a block of projected points, as far as they lie in the photo widened by `margin` cells.
     pub fn locate(&self, block: &Block, margin: usize, cells: &mut Located) {
         #[cfg(target_arch = "x86_64")]
         match Registers::here() {
@@ -248,7 +292,7 @@ pub(crate) fn fetch<T>(cells: &[T], cell: u32) {
 
 /// Calls `put(located, indices)` for every block of points that may meet the grid, in parallel.
 fn scatter(view: &View, grid: &Grid, xyz: &[[f64; 3]], put: impl Fn(&Located, std::ops::Range<usize>) + Sync) {
-    let (projector, frustum) = (BlockProjector::new(view), Frustum::new(view, grid.margin as f64));
+    let (projector, frustum) = (BlockProjector::new(view), Frustum::new(view, grid.pixels().margin as f64));
     xyz.par_chunks(TASK).enumerate().filter(|(_, points)| frustum.meets(points)).for_each(|(task, points)| {
         let (mut block, mut located) = (Block::new(), Located::new());
         for (k, points) in points.chunks(LANES).enumerate() {
@@ -260,7 +304,7 @@ fn scatter(view: &View, grid: &Grid, xyz: &[[f64; 3]], put: impl Fn(&Located, st
     });
 }
 
-/// The nearest depth in each pixel.
+/// The nearest depth in each pixel, or in each of its parts.
 pub struct DepthBuffer {
     view: View,
     grid: Grid,
@@ -269,9 +313,14 @@ pub struct DepthBuffer {
 }
 
 impl DepthBuffer {
-    /// An empty buffer.
+    /// An empty buffer of pixels.
     pub fn new(view: View) -> Result<Self> {
-        let grid = Grid::new(&view)?;
+        Self::finer(view, 1)
+    }
+
+    /// An empty buffer with so many cells along a pixel's side, a power of two.
+    pub fn finer(view: View, fineness: usize) -> Result<Self> {
+        let grid = Grid::finer(&view, fineness)?;
         let cells = zeros(grid.len(), "a depth buffer")?;
         Ok(Self { view, grid, cells })
     }
@@ -385,4 +434,43 @@ impl IndexBuffer {
 #[inline(always)]
 pub(super) fn nearest_of(cell: u64) -> (f32, u32) {
     (f32::from_bits((cell >> 32) as u32), !(cell as u32))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::{Camera, Pose};
+
+    fn scattered(count: usize) -> Vec<[f64; 3]> {
+        let mut state = 11_u32;
+        let mut random = || {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            f64::from(state >> 8) / f64::from(1 << 24) - 0.5
+        };
+        (0..count).map(|_| [12.0 * random(), 8.0 * random(), 6.0 * random()]).collect()
+    }
+
+    #[test]
+    fn parts_of_pixels_hold_what_pixels_hold() {
+        let pinhole = Camera::new(Model::Pinhole, 96, 64, &[70.0, 71.0, 47.3, 31.9]).unwrap();
+        let panorama = Camera::new(Model::Equirectangular, 128, 64, &[]).unwrap();
+        let points = scattered(20_000);
+        for camera in [pinhole, panorama] {
+            let view = View { camera, pose: Pose::identity() };
+            let [pixels, parts] = [1, 4].map(|fineness| {
+                let buffer = DepthBuffer::finer(view, fineness).unwrap();
+                buffer.add(&points);
+                let grid = buffer.grid();
+                let mut samples = buffer.into_samples();
+                grid.wrap(&mut samples);
+                (grid, samples)
+            });
+            assert_eq!(parts.0.pixels(), pixels.0);
+            assert!(parts.0.in_pixels(&parts.1).unwrap() == pixels.1);
+            for (row, column) in [(0, 0), (63, 95), (17, 40)] {
+                let part = parts.0.cell(4 * column + 3, 4 * row + 1);
+                assert_eq!(parts.0.pixel_of(part), pixels.0.cell(column, row));
+            }
+        }
+    }
 }

@@ -13,7 +13,7 @@ import pytest
 from colourreg_rs import ControlPoint, PointCloud, _core, write_cloud
 from colourreg_rs.io.clouds import open_cloud
 from colourreg_rs.io.images import write_image
-from colourreg_rs.register.control import off_the_scan
+from colourreg_rs.register.control import off_the_scan, one_pick_twice
 from colourreg_rs.simulate import simulate
 
 WRONG = {
@@ -44,6 +44,18 @@ def judged(path, points):
 def test_honest_points_are_neither_refused_nor_suspected(scene):
     path, points = scene
     assert judged(path, points) == ((), ())
+
+
+def test_one_pick_under_two_names_is_told(scene):
+    _, points = scene
+    assert one_pick_twice(points) == ()
+    again = [
+        *points,
+        replace(points[0], name="again", role="check"),
+        replace(points[1], name="beside", xy=points[0].xy),
+    ]
+    (warning,) = one_pick_twice(again)
+    assert f"{points[0].name} and again" in warning and "beside" not in warning
 
 
 @pytest.mark.parametrize("what", WRONG)

@@ -94,7 +94,6 @@ H = "name,X,Y,Z,x,y\n"
         (H + 'T1,"1,5",2,3,4,5\n', ["line 2, column X", "'1,5'", "decimal comma"]),
         (H + "T1,1,2,3,4,5\nT1,1,2,3,4,5\n", ["lines 2 and 3", "'T1'"]),
         (H + "\n\nT1,1,2,3,4,5\n\nT1,1,2,3,4,5\n", ["lines 4 and 6"]),
-        (H + "T1,1,2,3,4,5\nT2,1,2,3,4,6\nT3,1,2,3.0,4,5\n", ["lines 2 and 4", "'T1' and 'T3' are one pick"]),
         (H + ",1,2,3,4,5\n", ["line 2", "without a name"]),
         (H + "T1,,2,3,4,5\n", ["line 2, column X", "is empty"]),
         (H + "T1,nan,2,3,4,5\n", ["line 2, column X", "no finite number"]),
@@ -151,7 +150,7 @@ point = st.builds(
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], derandomize=True)
-@given(st.lists(point, min_size=1, max_size=6, unique_by=(lambda p: p.name, lambda p: (*p.xyz, *p.xy))))
+@given(st.lists(point, min_size=1, max_size=6, unique_by=lambda p: p.name))
 def test_what_is_written_is_read_to_the_last_bit(tmp_path, points):
     path = tmp_path / "p.csv"
     write_points(path, points)

@@ -46,7 +46,6 @@ def read_points(path: str | Path) -> list[ControlPoint]:
     rows, header, separator = _table(path, text)
     points: list[ControlPoint] = []
     lines: dict[str, int] = {}
-    places: dict[bytes, str] = {}
     marks: dict[str, tuple[int, str]] = {}
     for line, cells in rows:
         row = _Row(path, line, dict(zip(header, cells, strict=True)), separator, marks)
@@ -71,12 +70,6 @@ def read_points(path: str | Path) -> list[ControlPoint]:
             )
         except InvalidInputError as error:
             raise FileError(path, f"line {line}: {error}", "correct the line") from error
-        # Equal in every digit: one pick, which would count twice, or check itself.
-        first = places.setdefault(np.concatenate([points[-1].xyz, points[-1].xy]).tobytes(), name)
-        if first != name:
-            raise FileError(
-                path, f"lines {lines[first]} and {line}: {first!r} and {name!r} are one pick", "delete one of them"
-            )
     if not points:
         raise FileError(path, "holds a header, but no points", "add a line for each point")
     return points

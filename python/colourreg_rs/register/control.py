@@ -42,6 +42,22 @@ def outside_cloud(control: Sequence[ControlPoint], reader: Any, path: Path) -> t
     return ()
 
 
+def one_pick_twice(control: Sequence[ControlPoint]) -> tuple[str, ...]:
+    """A pick under two names counts twice, and as a control and a check point checks itself: worth a warning, as lists
+    made by reconstructions have such points, too."""
+    first: dict[tuple[float, ...], str] = {}
+    same = [
+        (kept, p.name)
+        for p in control
+        if (kept := first.setdefault((*p.xyz.tolist(), *p.xy.tolist()), p.name)) != p.name
+    ]
+    if not same:
+        return ()
+    named = ", ".join(f"{a} and {b}" for a, b in same[:5])
+    more = f" and {len(same) - 5} more" if len(same) > 5 else ""
+    return (f"equal in every digit, so that one pick counts twice: {named}{more}",)
+
+
 def off_the_scan(control: Sequence[ControlPoint], reader: Any) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Warnings and doubts about control points that lie on nothing that was scanned.
 

@@ -11,7 +11,7 @@ from ..io.clouds import open_cloud
 from ..io.images import whole_photo_info
 from ..io.points import read_points
 from ..model import Registration
-from .control import check_photo_coordinates, off_the_scan, outside_cloud
+from .control import check_photo_coordinates, off_the_scan, one_pick_twice, outside_cloud
 from .dlt import by_dlt
 from .options import RegisterOptions, parse_prior
 from .resection import by_resection
@@ -66,7 +66,7 @@ def register_photo(
     control = read_points(points)
     with open_cloud(cloud) as reader:
         crs_wkt = reader.crs_wkt
-        warnings = outside_cloud(control, reader, points)
+        warnings = (*one_pick_twice(control), *outside_cloud(control, reader, points))
     check_photo_coordinates(control, info, points)
     try:
         if options.method == "dlt":

@@ -48,7 +48,8 @@ class View:
 
     def check_plausible(self) -> None:
         """Raises InvalidInputError for a focal length below 0.05 or above 10,000 times the longer side, a principal
-        point more than 1,000 times that away, and a distortion that leaves a field of less than a hundredth of it."""
+        point more than 1,000 times that away, and a distortion that moves what is near to it by half of its
+        distance."""
 
     @classmethod
     def dlt(cls, P: FloatArray, width: int, height: int, distortion: FloatArray) -> View:

@@ -75,9 +75,33 @@ class Accuracy:
         )
 
 
+#: Entries closer than this in the photo, px, and than this share of the points' extent in space are one pick: programs
+#: round.
+SAME_PX, SAME_SHARE = 1e-3, 1e-4
+
+
+def same_picks(points: Sequence[ControlPoint], others: Sequence[ControlPoint]) -> list[int]:
+    """For each point the first of the others that is the same pick, under whatever name; -1 where none is."""
+    if not points or not others:
+        return [-1] * len(points)
+    xyz, xy = np.stack([p.xyz for p in others]), np.stack([p.xy for p in others])
+    reach = SAME_SHARE * float(np.ptp(xyz, axis=0).max())
+    order = np.argsort(xy[:, 0], kind="stable")
+    columns = xy[order, 0]
+    found = []
+    for p in points:
+        near = order[slice(*np.searchsorted(columns, [p.xy[0] - SAME_PX, p.xy[0] + SAME_PX]))]
+        same = (np.abs(xy[near] - p.xy) <= SAME_PX).all(axis=1) & (np.abs(xyz[near] - p.xyz) <= reach).all(axis=1)
+        found.append(int(near[same].min()) if same.any() else -1)
+    return found
+
+
 @dataclass(frozen=True)
 class ViewEvaluation:
-    """The accuracy of one view: control and check points apart, and points that were left out, with their reason."""
+    """The accuracy of one view: control and check points apart, and points that were left out, with their reason.
+
+    ``known``: points that were given for the evaluation, and had taken part in the estimate, under whatever name.
+    """
 
     view: str
     points: tuple[PointError, ...]
@@ -85,6 +109,7 @@ class ViewEvaluation:
     check: Accuracy | None
     unseen: tuple[str, ...]
     rejected: tuple[str, ...]
+    known: tuple[str, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -98,6 +123,7 @@ class ViewEvaluation:
             "check": group(self.check),
             "unseen": list(self.unseen),
             "rejected": list(self.rejected),
+            "known": list(self.known),
             "points": [
                 {
                     "name": e.name,
@@ -139,14 +165,14 @@ def point_errors(view: View, points: Sequence[ControlPoint]) -> list[PointError]
 def evaluate_view(view: View, points: Sequence[ControlPoint] | None = None) -> ViewEvaluation:
     """The accuracy of a view at its own points, and at others that are given.
 
-    A given point that took part in the estimate (same name and same coordinates as a control point of the view) stays a
-    control point; every other one is a check point, whatever its file says: it took no part.
+    A given point that is one of the view's own (the same pick, under whatever name) keeps its part; every other one is
+    a check point, whatever its file says: it took no part.
     """
-    own = {p.name: p for p in view.points}
-    together = list(view.points)
-    for p in points or ():
-        known = own.get(p.name)
-        if known is not None and np.array_equal(known.xyz, p.xyz) and np.array_equal(known.xy, p.xy):
+    together, known = list(view.points), []
+    given = tuple(points or ())
+    for p, own in zip(given, same_picks(given, view.points), strict=True):
+        if own >= 0:
+            known.append(p.name)
             continue
         together.append(ControlPoint(p.name, p.xyz, p.xy, "check", p.sigma_xyz, p.sigma_xy))
     if not together:
@@ -163,6 +189,7 @@ def evaluate_view(view: View, points: Sequence[ControlPoint] | None = None) -> V
         check=Accuracy.of([e for e in used if e.role == "check"]),
         unseen=tuple(e.name for e in errors if e not in seen),
         rejected=tuple(e.name for e in errors if e.status == "rejected"),
+        known=tuple(known),
     )
 
 
@@ -179,6 +206,10 @@ def evaluate(registration: Registration, points: Sequence[ControlPoint] | None =
     """:func:`evaluate_view` for every view; given points belong to a registration of one view only."""
     refuse_points_of_several(registration.views, points)
     return tuple(evaluate_view(view, points) for view in registration.views)
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
 
 
 def table(evaluations: Iterable[ViewEvaluation]) -> str:
@@ -199,6 +230,11 @@ def table(evaluations: Iterable[ViewEvaluation]) -> str:
             )
         if e.check is None:
             lines.append("  no check points: these figures say how well the estimate fits, not how accurate it is")
+        if e.known:
+            lines.append(
+                f"  {len(e.known)} of the points given took part in the estimate, under this or another name, and "
+                f"check nothing: {_some(e.known)}"
+            )
         if e.rejected:
             lines.append(f"  rejected as blunders, not in the figures: {', '.join(e.rejected)}")
         if e.unseen:

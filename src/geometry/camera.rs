@@ -22,8 +22,8 @@ const FOCAL: (f64, f64) = (0.05, 1e4);
 /// of larger ones.
 const PRINCIPAL_POINT: f64 = 1e3;
 
-/// A lens whose field is smaller than this share of the longer side shows nothing.
-const FIELD: f64 = 0.01;
+/// So near to the principal point, in units of the longer side, no lens moves anything by half of its distance.
+const NEAR: f64 = 0.02;
 
 /// The camera models, with parameters in OpenCV's meaning.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -172,27 +172,49 @@ impl Camera {
         for (axis, value) in ["cx", "cy"].iter().zip([self.cx, self.cy]) {
             if value.abs() > PRINCIPAL_POINT * size {
                 return Err(Error::invalid(format!(
-                    "{} camera: {axis} = {value:?} is no place of a principal point, more than {PRINCIPAL_POINT} pictures \
-                     of {} × {} pixels away",
+                    "{} camera: {axis} = {value:?} is no place of a principal point: it is more than {PRINCIPAL_POINT} times \
+                     the longer side of {} × {} pixels away",
                     self.model.name(),
                     self.width,
                     self.height
                 )));
             }
         }
-        let field = match &self.lens {
-            Lens::Polynomial(lens) => self.fx.min(self.fy) * lens.max_r2.sqrt(),
-            Lens::Fisheye(lens) => self.fx.min(self.fy) * lens.max_theta,
-            Lens::Equirectangular => return Ok(()),
+        let near = NEAR * size / self.fx.min(self.fy);
+        let moved = match &self.lens {
+            Lens::Polynomial(lens) => [[near, 0.0], [-near, 0.0], [0.0, near], [0.0, -near]]
+                .map(|[x, y]| {
+                    let [xd, yd] = lens.distort_unchecked(x, y, near * near);
+                    (xd - x).hypot(yd - y)
+                })
+                .into_iter()
+                .fold(0.0, |a: f64, b| if b > a || b.is_nan() { b } else { a }),
+            Lens::Fisheye(lens) => (lens.distort(near.atan()) - near.atan()).abs(),
+            Lens::Equirectangular => 0.0,
         };
-        if field < FIELD * size {
+        if moved.is_nan() || moved > 0.5 * near {
             return Err(Error::invalid(format!(
-                "{} camera: its distortion turns the picture back {field:.2} pixels from the principal point, so that nothing \
-                 is seen: the terms are those of coordinates divided by the focal length, not of pixels or mm",
-                self.model.name()
+                "{} camera: its distortion moves what lies {:.0} pixels from the principal point by {:.3e} pixels, as no lens \
+                 does: its terms ({}) act on coordinates divided by the focal length, not on pixels or mm",
+                self.model.name(),
+                NEAR * size,
+                moved * self.fx.max(self.fy),
+                self.distortion_terms()
             )));
         }
         Ok(())
+    }
+
+    /// The distortion's terms that are not zero, as people write them.
+    fn distortion_terms(&self) -> String {
+        let k: &[f64] = match &self.lens {
+            Lens::Polynomial(lens) => &lens.k,
+            Lens::Fisheye(lens) => &lens.k,
+            Lens::Equirectangular => &[],
+        };
+        let names = self.model.parameters().iter().skip(4);
+        let given = names.zip(k).filter(|(_, value)| **value != 0.0);
+        given.map(|(name, value)| format!("{name} = {value:?}")).collect::<Vec<_>>().join(", ")
     }
 
     /// The same camera with a skew, as a decomposed DLT matrix has it.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import subprocess
 import sys
@@ -158,7 +159,11 @@ V = ("views", 0)
         (changed(*V, "camera", "params", "fx", value="3100"), ["views[0].camera.params.fx", "number", '"3100"']),
         (changed(*V, "camera", "params", "fx", value=-1.0), ["views[0]", "-1"]),
         (changed(*V, "camera", "params", "cx", value=1e300), ["views[0]", "cx = 1e300", "4000 × 3000"]),
-        (changed(*V, "camera", "params", "k1", value=-1e300), ["views[0]", "0.00 pixels from the principal point"]),
+        *[
+            (changed(*V, "camera", "params", name, value=value), ["views[0]", f"({name} = ", "80 pixels"])
+            for name, value in itertools.product(("k1", "k2", "k3", "p1", "p2"), (1e300, -1e300))
+        ],
+        (changed(*V, "camera", "params", "k1", value=0.1 * 3100**2), ["views[0]", "not on pixels"]),
         (changed(*V, "camera", "params", value={"fx": 1, "fy": 1, "cx": 0}), ["views[0]", "lacks cy"]),
         (changed(*V, "camera", "params", "k9", value=1), ["views[0]", "k9"]),
         (changed(*V, "camera", "width", value=0), ["views[0].camera.width", "greater than 0", "not 0"]),

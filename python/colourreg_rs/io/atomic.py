@@ -231,6 +231,7 @@ def _remedy(error: OSError) -> str | None:
 
     return {
         errno.ENOSPC: "free some space or write to another disk",
+        errno.EFBIG: "write to a disk that holds files of this size, or as LAZ",
         errno.EDQUOT: "free some space or write to another disk",
         errno.EACCES: "check the permissions of the folder",
         errno.EPERM: "check the permissions of the folder",

@@ -19,7 +19,7 @@ from ..overlap import Behind
 
 Bytes = npt.NDArray[np.uint8]
 
-#: Places, sizes and addresses are multiples of this: the largest that disks ask for.
+#: Places, sizes and addresses are multiples of this, which nearly all disks are content with.
 _BLOCK = 4096
 
 #: One buffer is filled, one waits, one is being written.
@@ -29,7 +29,8 @@ _BUFFERS = 3
 class DirectWriter:
     """Appends to an empty file while the next bytes are made.
 
-    Where the system or the disk knows no such writing, it is the ordinary one, with the same result.
+    Where the system or the disk knows no such writing, it is the ordinary one, with the same result. The process is
+    not to fork meanwhile: what the disk is just reading would be shared with the copy.
 
     Args:
         file: open for writing and empty; it is not to be written by others before :meth:`finish`.
@@ -91,7 +92,7 @@ class DirectWriter:
             try:
                 written += os.pwrite(self._direct, data[written:].data, place + written)
             except OSError as error:
-                if error.errno != errno.EINVAL:
+                if error.errno not in (errno.EINVAL, errno.EOPNOTSUPP, errno.ENOTSUP):
                     raise
                 self._leave()
         if written < len(data):

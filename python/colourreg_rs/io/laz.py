@@ -10,7 +10,9 @@ Everything in a file that would make the codec reserve memory is checked before 
 
 from __future__ import annotations
 
+import errno
 import io
+import os
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -407,6 +409,15 @@ def compress(scheme: Scheme, records: Bytes, table: tuple[tuple[int, int], ...])
     return Block(tuple(zip(sizes, held, strict=True)), data[8 : 8 + sum(held)])
 
 
+@contextmanager
+def _writing() -> Iterator[None]:
+    """The codec says only that it could not write; the disk is what ever keeps it from it."""
+    try:
+        yield
+    except lazrs.LazrsError as error:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)) from error
+
+
 class LazSink:
     """Compressed points on their way into a file whose header is already written."""
 
@@ -422,17 +433,17 @@ class LazSink:
         if splice:
             file.write(bytes(8))
         else:
+            file.flush()  # here, as the codec does not say what kept it from writing
             self._compressor = lazrs.ParLasZipCompressor(file, scheme.codec())
-            self._compressor.reserve_offset_to_chunk_table()
+            with _writing():
+                self._compressor.reserve_offset_to_chunk_table()
 
     def write(self, records: Bytes) -> None:
         """Compresses and appends records."""
         if self._waveforms:
             self._refuse_channels(records)
-        try:
+        with _writing():
             self._compressor.compress_many(records.reshape(-1))
-        except lazrs.LazrsError as error:
-            raise OSError(None, f"the compressed points could not be written ({error}); is the disk full?") from error
 
     def _refuse_channels(self, records: Bytes) -> None:
         """lazrs 0.8 spoils the waveform packets (point formats 9 and 10) of points of more than one scanner channel."""
@@ -450,7 +461,7 @@ class LazSink:
 
     def done(self) -> None:
         """Writes the table of blocks; the file then stands at its end."""
-        try:
+        with _writing():
             if self._compressor is not None:
                 self._compressor.done()
                 self._file.seek(0, io.SEEK_END)
@@ -460,5 +471,3 @@ class LazSink:
             self._file.seek(self._start)
             self._file.write(at.to_bytes(8, "little"))
             self._file.seek(0, io.SEEK_END)
-        except lazrs.LazrsError as error:
-            raise OSError(None, f"the compressed points could not be written ({error}); is the disk full?") from error

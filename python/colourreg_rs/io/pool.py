@@ -8,6 +8,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+#: Arrays that are kept in mind: more than reading, colouring and writing hold of chunks at once.
+_MOST = 16
+
 
 class Pool:
     """Arrays for one chunk after the other. Fresh memory costs as much as what is done with it.
@@ -27,6 +30,6 @@ class Pool:
             # References: the list's and that of the call. A view counts as one, since it holds what it looks into.
             if sys.getrefcount(self._held[i]) == 2 and len(self._held[i]) >= size:
                 return self._held[i][:size].view(kind).reshape(shape)
-        self._held = [memory for memory in self._held if sys.getrefcount(memory) > 3 or len(memory) >= size]
-        self._held.append(np.empty(size, np.uint8))
-        return self._held[-1].view(kind).reshape(shape)
+        memory = np.empty(size, np.uint8)
+        self._held = [*self._held[-_MOST + 1 :], memory]  # the oldest is its holder's alone from now on
+        return memory.view(kind).reshape(shape)

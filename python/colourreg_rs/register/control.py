@@ -10,6 +10,7 @@ import numpy as np
 
 from .. import _core
 from ..errors import FileError
+from ..evaluate import same_picks
 from ..io.images import PhotoInfo
 from ..model import ControlPoint, FloatArray
 from ..overlap import prefetched
@@ -43,19 +44,20 @@ def outside_cloud(control: Sequence[ControlPoint], reader: Any, path: Path) -> t
 
 
 def one_pick_twice(control: Sequence[ControlPoint]) -> tuple[str, ...]:
-    """A pick under two names counts twice, and as a control and a check point checks itself: worth a warning, as lists
-    made by reconstructions have such points, too."""
-    first: dict[tuple[float, ...], str] = {}
-    same = [
-        (kept, p.name)
-        for p in control
-        if (kept := first.setdefault((*p.xyz.tolist(), *p.xy.tolist()), p.name)) != p.name
-    ]
-    if not same:
-        return ()
-    named = ", ".join(f"{a} and {b}" for a, b in same[:5])
-    more = f" and {len(same) - 5} more" if len(same) > 5 else ""
-    return (f"equal in every digit, so that one pick counts twice: {named}{more}",)
+    """A pick under two names counts twice, and as a control and a check point checks itself: worth a warning, no more,
+    as lists made by reconstructions have such points."""
+    twice: list[str] = []
+    itself: list[str] = []
+    for p, first in zip(control, same_picks(control, control), strict=True):
+        other = control[first]
+        if other is not p:
+            (twice if other.role == p.role else itself).append(f"{other.name} and {p.name}")
+    said = ((twice, "one pick under two names, which counts twice"), (itself, "a control point that is its own check"))
+    return tuple(
+        f"{what}: {', '.join(pairs[:5])}" + (f" and {len(pairs) - 5} more" if len(pairs) > 5 else "")
+        for pairs, what in said
+        if pairs
+    )
 
 
 def off_the_scan(control: Sequence[ControlPoint], reader: Any) -> tuple[tuple[str, ...], tuple[str, ...]]:

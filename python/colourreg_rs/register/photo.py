@@ -58,6 +58,10 @@ def register_photo(
         raise InvalidInputError(
             f"method {options.method} needs control points: give a table with the columns name,X,Y,Z,x,y with --points"
         )
+    if options.method == "dlt" and (init or camera):
+        raise InvalidInputError(
+            "method dlt estimates its camera from the points alone: leave init and camera out, or use method resection"
+        )
     points = Path(points)
     start = starting_view(photo, info, Path(init) if init else None, Path(camera) if camera else None)
     if options.method == "resection":  # what the points are not to blame for

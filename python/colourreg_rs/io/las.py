@@ -154,8 +154,10 @@ class LasReader(CloudReader):
             file.seek(self.header.point_offset)
             while start < self.n_points:
                 records = pool.array((min(size, self.n_points - start), length), np.uint8)
-                if file.readinto(records.data) < records.nbytes:  # type: ignore[attr-defined]
-                    raise FileError(self.path, f"ends after {start:,} points", "did somebody change it meanwhile?")
+                got = file.readinto(records.data)  # type: ignore[attr-defined]
+                if got < records.nbytes:
+                    problem = f"ends after {start + got // length:,} points"
+                    raise FileError(self.path, problem, "did somebody change it meanwhile?")
                 yield LasChunk(self, start, records, None, pool=pool)
                 start += len(records)
                 del records  # a chunk that nobody keeps gives its memory to the next

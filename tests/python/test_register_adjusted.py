@@ -229,6 +229,7 @@ def test_a_dlt_from_twelve_elements_is_adjusted_too(folder, rng):
     assert np.allclose(twelve.view.covariance.matrix, eleven.view.covariance.matrix, rtol=1e-5, atol=1e-15)
     assert twelve.view.statistics["adjustment"]["points"] and "singular vector" in twelve.notes[0]
     assert "adjusted" in twelve.notes[0] and "NOT" not in twelve.notes[0]
+    assert any("does not use" in warning for warning in twelve.warnings)
 
 
 def test_a_robust_loss_says_that_nothing_is_adjusted(folder, rng):

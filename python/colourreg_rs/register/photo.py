@@ -58,10 +58,6 @@ def register_photo(
         raise InvalidInputError(
             f"method {options.method} needs control points: give a table with the columns name,X,Y,Z,x,y with --points"
         )
-    if options.method == "dlt" and (init or camera):
-        raise InvalidInputError(
-            "method dlt estimates its camera from the points alone: leave init and camera out, or use method resection"
-        )
     points = Path(points)
     start = starting_view(photo, info, Path(init) if init else None, Path(camera) if camera else None)
     if options.method == "resection":  # what the points are not to blame for
@@ -70,7 +66,7 @@ def register_photo(
     control = read_points(points)
     with open_cloud(cloud) as reader:
         crs_wkt = reader.crs_wkt
-        warnings = (*one_pick_twice(control), *outside_cloud(control, reader, points))
+        warnings = (*_unused(options, init, camera), *one_pick_twice(control), *outside_cloud(control, reader, points))
     check_photo_coordinates(control, info, points)
     try:
         if options.method == "dlt":
@@ -90,3 +86,11 @@ def register_photo(
         view = replace(view, statistics={**view.statistics, "doubts": list(result.doubts)})
     registration = Registration((view,), cloud, crs_wkt)
     return replace(result, registration=registration)
+
+
+def _unused(options: RegisterOptions, *given: str | Path | None) -> tuple[str, ...]:
+    """A DLT has a camera of its own: worth a warning where one is given."""
+    names = ", ".join(str(path) for path in given if path is not None)
+    if options.method != "dlt" or not names:
+        return ()
+    return (f"method dlt estimates its camera from the points alone, and does not use {names}",)

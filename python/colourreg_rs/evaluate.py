@@ -100,7 +100,7 @@ def same_picks(points: Sequence[ControlPoint], others: Sequence[ControlPoint]) -
 class ViewEvaluation:
     """The accuracy of one view: control and check points apart, and points that were left out, with their reason.
 
-    ``known``: points that were given for the evaluation, and had taken part in the estimate, under whatever name.
+    ``known``: points that were given for the evaluation, and are the registration's own, under whatever name.
     """
 
     view: str
@@ -110,6 +110,16 @@ class ViewEvaluation:
     unseen: tuple[str, ...]
     rejected: tuple[str, ...]
     known: tuple[str, ...] = ()
+
+    def remarks(self) -> tuple[str, ...]:
+        """What is to be said of the points beside their figures."""
+        if not self.known:
+            return ()
+        named = ", ".join(self.known[:8]) + (f" and {len(self.known) - 8} more" if len(self.known) > 8 else "")
+        return (
+            f"{len(self.known)} of the points given are the registration's own, under these or other names, and stay the "
+            f"control and check points that they are there: {named}",
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -208,10 +218,6 @@ def evaluate(registration: Registration, points: Sequence[ControlPoint] | None =
     return tuple(evaluate_view(view, points) for view in registration.views)
 
 
-def _some(names: Sequence[str]) -> str:
-    return ", ".join(names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
-
-
 def table(evaluations: Iterable[ViewEvaluation]) -> str:
     """The figures as lines of text."""
     lines = []
@@ -230,11 +236,7 @@ def table(evaluations: Iterable[ViewEvaluation]) -> str:
             )
         if e.check is None:
             lines.append("  no check points: these figures say how well the estimate fits, not how accurate it is")
-        if e.known:
-            lines.append(
-                f"  {len(e.known)} of the points given took part in the estimate, under this or another name, and "
-                f"check nothing: {_some(e.known)}"
-            )
+        lines += [f"  {remark}" for remark in e.remarks()]
         if e.rejected:
             lines.append(f"  rejected as blunders, not in the figures: {', '.join(e.rejected)}")
         if e.unseen:

@@ -90,6 +90,16 @@ def test_check_points_off_by_more_than_the_covariance_allows_are_bad(rng):
     assert any("contradict the covariance" in line for line in advice(wrong))
 
 
+def test_control_points_under_other_names_are_no_check(rng):
+    problem = case(24, rng)
+    points = control(*problem.noisy(rng))
+    view = registered(points, sigma_xy=0.5, sigma_xyz=0.003)
+    renamed = [ControlPoint(f"n{p.name}", np.round(p.xyz, 4), np.round(p.xy, 4), "check") for p in points]
+    assessed = assess_view(view, renamed)
+    assert assessed.check is None and assessed.evaluation.check is None
+    assert any("24 of the points given are the registration's own" in remark for remark in assessed.evaluation.remarks())
+
+
 def test_without_a_covariance_nothing_is_promised(rng):
     problem = case(10, rng)
     view = View("photo", None, CAMERA, POSE, points=control(*problem.noisy(rng)))

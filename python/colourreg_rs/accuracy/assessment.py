@@ -15,7 +15,7 @@ import numpy as np
 
 from .. import _core
 from ..errors import DegenerateError, InvalidInputError
-from ..evaluate import ViewEvaluation, evaluate_view
+from ..evaluate import ViewEvaluation, evaluate_view, same_picks
 from ..matching.correspondences import pixels_per_radian
 from ..model import ControlPoint, FloatArray, View
 from .view_adjustment import NOMINAL_SIGMA, PointSigmas, plain
@@ -124,7 +124,8 @@ def assess_view(view: View, points: Sequence[ControlPoint] | None = None) -> Vie
         notes.append("the registration holds no covariance: how sure the view is over the photo is not known")
     depths = [e.depth for e in evaluation.points if np.isfinite(e.depth)] if evaluation else []
     depth = float(np.median(depths)) if depths else float("nan")
-    checks = [p for p in points or () if not _took_part(view, p)]
+    given = tuple(points or ())
+    checks = [p for p, own in zip(given, same_picks(given, view.points), strict=True) if own < 0]
     return ViewAssessment(
         view=view,
         evaluation=evaluation,
@@ -143,13 +144,6 @@ def at_depth(assessed: ViewAssessment, depth: float) -> ViewAssessment:
     if np.isfinite(assessed.depth) or not np.isfinite(depth):
         return assessed
     return replace(assessed, depth=depth, error_map=error_map(assessed.view, depth))
-
-
-def _took_part(view: View, point: ControlPoint) -> bool:
-    return any(
-        p.name == point.name and np.array_equal(p.xyz, point.xyz) and np.array_equal(p.xy, point.xy)
-        for p in view.points
-    )
 
 
 def check_test(view: View, points: Sequence[ControlPoint], adjustment: dict[str, Any] | None) -> dict[str, Any] | None:

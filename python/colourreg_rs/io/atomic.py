@@ -12,6 +12,7 @@ import os
 import secrets
 import stat
 from collections.abc import Iterable, Iterator, Sequence
+from io import BufferedReader
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any
@@ -187,7 +188,7 @@ def reading(path: str | Path) -> Iterator[Any]:
             raise FileError(path, f"cannot be read: {reason(error)}", None) from error
 
 
-def open_binary(path: str | Path) -> IO[bytes]:
+def open_binary(path: str | Path) -> BufferedReader:
     """Opens a regular file for reading bytes, or raises :class:`FileError`."""
     path = Path(path)
     try:
@@ -203,7 +204,7 @@ def open_binary(path: str | Path) -> IO[bytes]:
         raise FileError(path, f"cannot be read: {detail}", None) from error
 
 
-def reopen(path: Path, first: IO[bytes]) -> IO[bytes]:
+def reopen(path: Path, first: IO[bytes]) -> BufferedReader:
     """The open file ``first`` once more, with a position of its own; refused when ``path`` is another file by now."""
     file = open_binary(path)
     a, b = os.fstat(first.fileno()), os.fstat(file.fileno())

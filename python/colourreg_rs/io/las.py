@@ -7,8 +7,9 @@ import re
 import threading
 from collections.abc import Iterator
 from functools import cached_property
+from io import BufferedReader
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -146,7 +147,7 @@ class LasReader(CloudReader):
         except OSError as error:
             raise FileError(self.path, f"cannot be read: {reason(error)}", None) from error
 
-    def _chunks(self, file: IO[bytes], size: int, positions_only: bool) -> Iterator[LasChunk]:
+    def _chunks(self, file: BufferedReader, size: int, positions_only: bool) -> Iterator[LasChunk]:
         start, pool = 0, Pool()
         if self.laz is None:
             length = self.header.record_length
@@ -154,7 +155,7 @@ class LasReader(CloudReader):
             file.seek(self.header.point_offset)
             while start < self.n_points:
                 records = pool.array((min(size, self.n_points - start), length), np.uint8)
-                got = file.readinto(records.data)  # type: ignore[attr-defined]
+                got = file.readinto(records.data)
                 if got < records.nbytes:
                     problem = f"ends after {start + got // length:,} points"
                     raise FileError(self.path, problem, "did somebody change it meanwhile?")

@@ -92,7 +92,7 @@ class PlyReader(CloudReader):
             raise FileError(self.path, problem, "the file is truncated: copy it again")
         while left:
             lines = sum(1 for line in itertools.islice(self._file, min(left, _ROWS)) if line.strip())
-            if not lines and not self._file.peek(1)[:1]:  # type: ignore[attr-defined]  # a BufferedReader
+            if not lines and not self._file.peek(1)[:1]:
                 problem = f"announces {self.n_points:,} points, but holds only {self.n_points - left:,}"
                 raise FileError(self.path, problem, "the file is truncated: copy it again")
             left -= lines

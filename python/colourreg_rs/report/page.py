@@ -89,7 +89,7 @@ def _view(assessed: ViewAssessment, pixels: Any) -> dict[str, Any]:
         "word": word,
         "headline": sentence,
         "advice": advice(assessed),
-        "notes": assessed.notes,
+        "notes": [*assessed.notes, *(assessed.evaluation.remarks() if assessed.evaluation else ())],
         "tiles": _tiles(assessed),
         "overlay": pictures.residual_overlay(assessed, photo, caption) if errors else None,
         "factor": f"{factor:g}",

@@ -117,8 +117,8 @@ class ViewEvaluation:
             return ()
         named = ", ".join(self.known[:8]) + (f" and {len(self.known) - 8} more" if len(self.known) > 8 else "")
         return (
-            f"{len(self.known)} of the points given are the registration's own, under these or other names, and stay the "
-            f"control and check points that they are there: {named}",
+            f"{len(self.known)} of the points given are the registration's own, under these or other names, and stay "
+            f"the control and check points that they are there: {named}",
         )
 
     def as_dict(self) -> dict[str, Any]:

@@ -66,7 +66,8 @@ def test_points_that_took_no_part_are_check_points_whatever_their_file_says(rng)
     # Another name, and a program's rounding, make no new measurement of a pick.
     others = [ControlPoint(f"n{p.name}", np.round(p.xyz, 4), np.round(p.xy, 4), "check") for p in points[:10]]
     result = evaluate_view(view, others)
-    assert result.check is None and len(result.known) == 10 and "points that they are there: nP0, nP1" in table([result])
+    assert result.check is None and len(result.known) == 10
+    assert "points that they are there: nP0, nP1" in table([result])
     renamed = ControlPoint(points[0].name, points[0].xyz, points[0].xy + 1.0)
     assert evaluate_view(view, [renamed]).check.n == 1
 
